@@ -1,0 +1,63 @@
+"""`sivo VERB ...`: finds the command's module, runs it, and turns errors into one line and exit status 2."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from types import ModuleType
+
+from sivo import __version__
+from sivo.errors import SivoError
+
+# verb -> (module under sivo.cli, help line). A module has `add_arguments(parser)` and `run(arguments) -> int | None`;
+# a verb with its own sub-commands adds them with `parser.add_subparsers`. Heavy imports belong inside `run`.
+COMMANDS: dict[str, tuple[str, str]] = {
+    "run": ("run", "visual odometry on one sequence: trajectory, map, tracks"),
+    "show": ("show", "pictures of a finished run"),
+    "config": ("config", "print all settings of a command as YAML"),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point. Returns the exit status: 0 done, 2 an error that the user can mend, 130 interrupted."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        verb = next((word for word in words if not word.startswith("-")), None)
+        arguments = _parser(verb).parse_args(words)
+        return int(arguments.module.run(arguments) or 0)
+    except SivoError as error:
+        print(f"sivo: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("sivo: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _parser(verb: str | None) -> argparse.ArgumentParser:
+    """The parser of all verbs; only the chosen one's module is imported."""
+    parser = argparse.ArgumentParser(
+        prog="sivo",
+        description="Self-improving visual odometry: unlabelled video in, a trajectory, a map and a better frontend out.",
+        epilog="`sivo VERB --help` shows a command's options with their defaults.",
+    )
+    parser.add_argument("--version", action="version", version=f"sivo {__version__}")
+    verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
+    for name, (module_name, help_line) in COMMANDS.items():
+        verb_parser = verbs.add_parser(
+            name, help=help_line, description=help_line, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+        )
+        if name == verb:
+            module: ModuleType = importlib.import_module(f"sivo.cli.{module_name}")
+            module.add_arguments(verb_parser)
+            verb_parser.set_defaults(module=module)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Cameras, rigid motions, alignment: pure NumPy, float64."""

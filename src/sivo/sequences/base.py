@@ -1,0 +1,74 @@
+"""What a recording is, and the sequence of frames that the rest of sivo sees."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from sivo.geometry.camera import Camera
+from sivo.types import Float32, Float64, Trajectory, UInt8
+
+
+class UnreadableFrameError(Exception):
+    """One frame cannot be decoded; the sequence skips it, counts it and names it."""
+
+
+class Recording(ABC):
+    """One recording as it lies on disk, by random access; a format is one file with one subclass."""
+
+    format: ClassVar[str]  # as in --format
+
+    path: Path
+    camera: Camera | None  # of the raw images, with distortion; None where the format has no calibration
+    times: Float64  # (N,) seconds
+    ground_truth: Trajectory | None = None  # rows at their own time stamps
+
+    @classmethod
+    @abstractmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether the path looks like this format; cheap, no decoding."""
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @abstractmethod
+    def source(self, index: int) -> str:
+        """Where frame `index` comes from: a file, or "video.mp4#123"."""
+
+    @abstractmethod
+    def image(self, index: int) -> UInt8:
+        """The raw image (H, W) grey or (H, W, 3) BGR.
+
+        Raises:
+            UnreadableFrameError: it cannot be decoded.
+        """
+
+    def depth(self, index: int) -> Float32 | None:
+        """Depth in metres (H, W) registered to the raw image, NaN where missing; None where there is none."""
+        return None
+
+
+@dataclass(frozen=True)
+class SequenceSettings:
+    """How a recording is read."""
+
+    format: str = "auto"
+    camera: str | None = None  # a calibration file, or "fx,fy,cx,cy[,k1,k2,p1,p2,k3]"
+    fov: float | None = None  # horizontal field of view in degrees, where nothing better is known
+    fps: float | None = None  # frame rate of recordings without time stamps
+    start: int = 0  # first frame of the recording
+    end: int | None = None  # one past the last frame of the recording
+    stride: int = 1  # every n-th frame
+    max_frames: int | None = None  # after the stride
+    width: int | None = None  # resize to this width, keeping the aspect ratio
+
+
+@dataclass(frozen=True)
+class SkippedFrame:
+    """A frame that could not be read."""
+
+    index: int  # position in the recording
+    source: str
+    reason: str

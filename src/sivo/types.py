@@ -1,0 +1,113 @@
+"""The nouns that the rooms pass to each other, as frozen dataclasses with shapes.
+
+Conventions (see docs/conventions.md): pixels are (x right, y down) with the centre of the top-left pixel at (0, 0);
+`cam_from_world` maps world points into a camera; times are seconds; features are float32, geometry float64.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+UInt8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of a sequence, as delivered: undistorted, resized, grey."""
+
+    index: int  # position in the recording, before any stride
+    time: float  # seconds, the recording's own clock
+    image: UInt8  # (H, W)
+    source: str  # the file, or "video.mp4#123"
+
+
+@dataclass(frozen=True)
+class Features:
+    """Keypoints of one image with their descriptors (paper, "Convolutional Frontend")."""
+
+    keypoints: Float32  # (N, 2) x, y in pixels
+    descriptors: NDArray[np.generic]  # (N, D) float32 of unit L2 norm, or (N, B) uint8 packed bits
+    scores: Float32  # (N,) detection confidence, larger is better
+    stability: Float32 | None = None  # (N,) probability in [0, 1]; None where the frontend has no stability head
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+    @property
+    def binary(self) -> bool:
+        """Whether descriptors are bit strings, compared by Hamming distance."""
+        return bool(self.descriptors.dtype == np.uint8)
+
+    def weights(self) -> Float32:
+        """Observation confidence w_ij (N,), paper "Observation Variables": the stability, or 1 without that head."""
+        if self.stability is None:
+            return np.ones(len(self), np.float32)
+        return self.stability
+
+    def take(self, rows: NDArray[np.generic]) -> Features:
+        """The features of the given rows (indices or mask), in that order."""
+        stability = None if self.stability is None else self.stability[rows]
+        return Features(self.keypoints[rows], self.descriptors[rows], self.scores[rows], stability)
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Connect-the-dots tracks as flat observations, one row per (frame, track), sorted by track, then frame."""
+
+    frame: Int64  # (M,) position in the processed sequence (after stride), 0-based
+    track: Int64  # (M,) track id
+    keypoints: Float32  # (M, 2) pixels
+    weight: Float32  # (M,) observation confidence w_ij
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Camera poses over time; a row without a pose is NaN.
+
+    Poses of one segment share a world frame and a scale; those of different segments do not.
+    """
+
+    times: Float64  # (N,) seconds, increasing
+    world_from_cam: Float64  # (N, 4, 4), NaN where there is no pose
+    segment: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (N,) segment number, -1 without pose
+
+    def __post_init__(self) -> None:
+        if len(self.segment) != len(self.times):
+            object.__setattr__(self, "segment", np.where(self.valid, 0, -1).astype(np.int64))
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(N,) whether the row has a pose."""
+        return np.isfinite(self.world_from_cam).all(axis=(1, 2))
+
+    @property
+    def positions(self) -> Float64:
+        """(N, 3) camera centres in the world."""
+        return self.world_from_cam[:, :3, 3]
+
+
+@dataclass(frozen=True)
+class SparseMap:
+    """3D points of a finished run (paper, "Optimization Variables")."""
+
+    ids: Int64  # (P,) point id
+    xyz: Float64  # (P, 3) world
+    observations: Int64  # (P,) number of images that the point was observed in
+    mean_error: Float64  # (P,) pixels
+    max_error: Float64  # (P,) pixels
+    segment: Int64  # (P,) segment that the point belongs to
+
+    def __len__(self) -> int:
+        return len(self.ids)
