@@ -114,7 +114,7 @@ def _refuse_unknown_keys(cls: type, values: Any, where: str, prefix: str) -> Non
             mend = f"did you mean `{prefix}{close[0]}`?" if close else f"known: {', '.join(known)}"
             raise ConfigError(f"{where}: unknown setting `{prefix}{key}`; {mend}")
         if dataclasses.is_dataclass(known[key]):
-            _refuse_unknown_keys(known[key], value, where, f"{prefix}{key}.")  # type: ignore[arg-type]
+            _refuse_unknown_keys(known[key], value, where, f"{prefix}{key}.")
 
 
 def _first_reason(error: Any) -> str:
@@ -122,7 +122,5 @@ def _first_reason(error: Any) -> str:
     path: list[str] = []
     while getattr(error, "exceptions", None):
         error = error.exceptions[0]
-        for note in getattr(error, "__notes__", []):
-            if "attribute" in note:
-                path.append(str(note).rsplit(" ", 1)[-1])
+        path += [str(note).rsplit(" ", 1)[-1] for note in getattr(error, "__notes__", []) if "attribute" in note]
     return f"setting `{'.'.join(path)}`: {error}" if path else str(error)

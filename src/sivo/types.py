@@ -90,7 +90,7 @@ class Trajectory:
     @property
     def valid(self) -> NDArray[np.bool_]:
         """(N,) whether the row has a pose."""
-        return np.isfinite(self.world_from_cam).all(axis=(1, 2))
+        return np.asarray(np.isfinite(self.world_from_cam).all(axis=(1, 2)))
 
     @property
     def positions(self) -> Float64:

@@ -43,7 +43,7 @@ def _parser(verb: str | None) -> argparse.ArgumentParser:
     """The parser of all verbs; only the chosen one's module is imported."""
     parser = argparse.ArgumentParser(
         prog="sivo",
-        description="Self-improving visual odometry: unlabelled video in, a trajectory, a map and a better frontend out.",
+        description="Self-improving visual odometry: video in; a trajectory, a map and a better frontend out.",
         epilog="`sivo VERB --help` shows a command's options with their defaults.",
     )
     parser.add_argument("--version", action="version", version=f"sivo {__version__}")

@@ -1,4 +1,4 @@
-"""Rigid motions as 4x4 matrices, `a_from_b`: x_a = R x_b + t. All arrays are float64 and broadcast over leading axes."""
+"""Rigid motions as 4x4 float64 matrices, `a_from_b`: x_a = R x_b + t; leading axes broadcast."""
 
 from __future__ import annotations
 
