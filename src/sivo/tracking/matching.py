@@ -1,0 +1,58 @@
+"""Mutual nearest neighbours (paper, "Point Tracks").
+
+Every descriptor becomes a unit vector, so that one product of matrices serves all: bits b of a binary descriptor
+become (2b - 1) / sqrt(number of bits), for which the squared distance is 4 x (share of differing bits).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sivo.types import Features, Float32, Int64
+
+RANDOM_DISTANCE = float(np.sqrt(2.0))  # expected distance of two unrelated unit descriptors
+
+
+def unit_descriptors(features: Features) -> Float32:
+    """The descriptors as unit float32 vectors (N, D)."""
+    if not features.binary:
+        return np.asarray(features.descriptors, np.float32)
+    bits = np.unpackbits(np.asarray(features.descriptors, np.uint8), axis=1)
+    scale = np.float32(1.0 / np.sqrt(max(bits.shape[1], 1)))
+    return (bits.astype(np.float32) * 2.0 - 1.0) * scale
+
+
+def distance_threshold(features: Features, max_distance: float) -> float:
+    """The paper's threshold tau on unit descriptors, or its equivalent share of differing bits as a distance.
+
+    tau = 0.7 admits 0.7 / 1.41 of the distance between unrelated float descriptors; binary ones are admitted up to the
+    same share of the Hamming distance between unrelated ones: 63 of 256 bits.
+    """
+    if not features.binary:
+        return max_distance
+    return float(np.sqrt(2.0 * max_distance / RANDOM_DISTANCE))
+
+
+def mutual_nearest_neighbours(a: Features, b: Features, max_distance: float | None = None) -> Int64:
+    """Index pairs (K, 2) of mutually nearest descriptors, sorted by the index in `a`.
+
+    Args:
+        a, b: features of two images, by the same frontend.
+        max_distance: tau, drop pairs farther apart (scaled for binary descriptors); None keeps all.
+    """
+    threshold = None if max_distance is None else distance_threshold(a, max_distance)
+    return match_units(unit_descriptors(a), unit_descriptors(b), threshold)
+
+
+def match_units(a: Float32, b: Float32, max_distance: float | None = None) -> Int64:
+    """As `mutual_nearest_neighbours`, on unit vectors (N, D) and (M, D), without scaling the threshold."""
+    if len(a) == 0 or len(b) == 0:
+        return np.zeros((0, 2), np.int64)
+    similarity = a @ b.T
+    nearest_in_b = similarity.argmax(axis=1)
+    nearest_in_a = similarity.argmax(axis=0)
+    rows = np.flatnonzero(nearest_in_a[nearest_in_b] == np.arange(len(a)))
+    if max_distance is not None:
+        # ||x - y||^2 = 2 - 2 x.y for unit vectors
+        rows = rows[2.0 - 2.0 * similarity[rows, nearest_in_b[rows]] <= max_distance**2]
+    return np.stack([rows, nearest_in_b[rows]], axis=1).astype(np.int64)
