@@ -1,0 +1,223 @@
+"""The trajectory protocol: association by time, alignment, ATE, relative errors (Zhang and Scaramuzza 2018).
+
+Segments of an estimate do not share a world or a scale, so each is aligned on its own, and no sub-trajectory
+reaches from one into another. That makes short segments easy: always read the errors beside the number of segments
+and the share of frames that have a pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sivo.errors import ConfigError, InputError
+from sivo.evaluation.relative import RelativeErrors, Spread, path_lengths, relative_errors
+from sivo.geometry.alignment import Similarity, align_points
+from sivo.geometry.se3 import nearest_rotation, rotation_angle_deg
+from sivo.types import Float64, Int64, Trajectory
+
+ALIGNMENTS = ("sim3", "se3", "none")
+
+
+@dataclass(frozen=True)
+class TrajectorySettings:
+    """How an estimated trajectory is held against the truth."""
+
+    alignment: str = "sim3"  # sim3 (monocular), se3 (metric scale) or none (same world); each segment on its own
+    max_time_difference: float = 0.02  # seconds between an estimated pose and the true one
+    time_windows: tuple[float, ...] = (2.0, 5.0, 10.0)  # sub-trajectories in seconds, paper Table 2
+    distance_windows: tuple[float, ...] = ()  # sub-trajectories in metres; KITTI: 100, 200, ... 800
+    path_fractions: tuple[float, ...] = (0.1, 0.2, 0.3, 0.4, 0.5)  # sub-trajectories as a share of the true path
+    window_tolerance: float = 0.2  # a sub-trajectory may be this share longer or shorter than asked for
+
+    def __post_init__(self) -> None:
+        if self.alignment not in ALIGNMENTS:
+            raise ConfigError(f"alignment `{self.alignment}` is unknown; choose one of {', '.join(ALIGNMENTS)}")
+        lengths = (*self.time_windows, *self.distance_windows, *self.path_fractions, self.window_tolerance)
+        if not np.isfinite(lengths).all() or min(lengths) <= 0:
+            raise ConfigError("sub-trajectory lengths and window_tolerance must be positive numbers")
+        if not self.max_time_difference >= 0:
+            raise ConfigError("max_time_difference must be 0 or more seconds")
+
+
+@dataclass(frozen=True)
+class SegmentErrors:
+    """Absolute errors of one segment of the estimate."""
+
+    segment: int
+    poses: int  # with a true pose at their time
+    seconds: float
+    path_m: float  # true path over these poses
+    scale: float | None  # of the alignment; None where the segment could not be aligned
+    ate_m: Spread | None  # absolute trajectory error: distance of the positions after alignment
+    ate_percent: float | None  # its rmse as a share of the true path
+    rotation_deg: Spread | None  # orientation error after alignment
+    note: str  # why the segment has no errors; empty otherwise
+
+
+@dataclass(frozen=True)
+class TrajectoryErrors:
+    """How far an estimated trajectory is from the truth."""
+
+    alignment: str
+    estimate_poses: int  # valid poses of the estimate
+    truth_poses: int  # valid poses of the truth
+    poses: int  # of both at a common time
+    invalid_truth: tuple[float, ...]  # times of true poses that are NaN or not rigid, left out
+    path_m: float  # true path over the evaluated poses, all segments
+    ate_m: Spread | None  # over the poses of all aligned segments
+    ate_percent: float | None  # its rmse as a share of path_m
+    rotation_deg: Spread | None
+    segments: tuple[SegmentErrors, ...]
+    relative: tuple[RelativeErrors, ...]  # by time, then by distance, then by share of the path
+
+
+def clean_truth(truth: Trajectory, tolerance: float = 0.02) -> tuple[Trajectory, NDArray[np.bool_]]:
+    """The truth with its rotations projected to SO(3), and which of its rows are unusable.
+
+    Pose files are orthonormal only to their printed digits (7-Scenes: 3e-4), so small deviations are repaired; rows
+    that are NaN or further than `tolerance` (Frobenius) from a rotation become NaN.
+
+    Returns:
+        The repaired trajectory and a mask (N,) of the rows that are NaN in it.
+    """
+    poses = np.array(truth.world_from_cam)
+    good = np.isfinite(poses).all(axis=(1, 2))
+    rotation = np.broadcast_to(np.eye(3), (len(poses), 3, 3)).copy()
+    rotation[good] = poses[good, :3, :3]
+    repaired = nearest_rotation(rotation)
+    good &= np.linalg.norm(repaired - rotation, axis=(1, 2)) <= tolerance
+    poses[:, :3, :3] = repaired
+    poses[~good] = np.nan
+    return Trajectory(truth.times, poses, np.where(good, truth.segment, -1)), ~good
+
+
+def associate(first: Float64, second: Float64, max_difference: float) -> Int64:
+    """Rows (K, 2) of two lists of times that belong together: mutually nearest and at most `max_difference` apart.
+
+    Args:
+        first, second: seconds, (N,) and (M,), increasing.
+    """
+    if len(first) == 0 or len(second) == 0:
+        return np.zeros((0, 2), np.int64)
+    to_second, to_first = _nearest(second, first), _nearest(first, second)
+    rows = np.arange(len(first))
+    near = np.abs(second[to_second] - first) <= max_difference + 1e-9
+    keep = near & (to_first[to_second] == rows)
+    return np.stack([rows[keep], to_second[keep]], axis=1).astype(np.int64)
+
+
+def _nearest(times: Float64, queries: Float64) -> Int64:
+    after = np.clip(np.searchsorted(times, queries), 1, max(len(times) - 1, 1))
+    if len(times) == 1:
+        return np.zeros(len(queries), np.int64)
+    nearer_before = queries - times[after - 1] <= times[after] - queries
+    return np.where(nearer_before, after - 1, after).astype(np.int64)
+
+
+def align(truth: Float64, estimate: Float64, alignment: str) -> Similarity:
+    """The motion that carries estimated positions (N, 3) onto true ones: `sim3`, `se3` or `none` (identity).
+
+    Raises:
+        InputError: fewer than three poses, or positions that leave the scale or rotation undefined.
+    """
+    if alignment == "none":
+        return Similarity(1.0, np.eye(3), np.zeros(3))
+    if len(truth) >= 3 and np.ptp(truth, axis=0).max() < 1e-9:
+        raise InputError("alignment is undefined: all positions of the truth coincide")
+    return align_points(truth, estimate, with_scale=alignment == "sim3")
+
+
+def evaluate_trajectory(
+    estimate: Trajectory,
+    truth: Trajectory,
+    settings: TrajectorySettings | None = None,
+    names: tuple[str, str] = ("the estimate", "the truth"),
+) -> TrajectoryErrors:
+    """Hold an estimate against the truth.
+
+    Args:
+        estimate: poses at any scale; each of its segments is aligned on its own.
+        truth: poses in metres.
+        settings: alignment and window lengths.
+        names: of the two, for messages.
+
+    Raises:
+        InputError: no valid pose in one of them, or no common time.
+    """
+    settings = settings or TrajectorySettings()
+    clean, unusable = clean_truth(truth)
+    for trajectory, name in ((estimate, names[0]), (clean, names[1])):
+        if not trajectory.valid.any():
+            raise InputError(f"{name}: has no valid pose among {len(trajectory)}; check the file")
+    estimate_rows, truth_rows = np.flatnonzero(estimate.valid), np.flatnonzero(clean.valid)
+    pairs = associate(estimate.times[estimate_rows], clean.times[truth_rows], settings.max_time_difference)
+    if len(pairs) == 0:
+        raise InputError(_no_common_time(estimate, clean, settings.max_time_difference, names))
+    estimate_rows, truth_rows = estimate_rows[pairs[:, 0]], truth_rows[pairs[:, 1]]
+
+    segments: list[SegmentErrors] = []
+    positions, angles, pieces = [], [], []
+    for segment in np.unique(estimate.segment[estimate_rows]):
+        chosen = estimate.segment[estimate_rows] == segment
+        times = clean.times[truth_rows[chosen]]
+        true_poses = clean.world_from_cam[truth_rows[chosen]]
+        poses = estimate.world_from_cam[estimate_rows[chosen]]
+        path = float(path_lengths(true_poses[:, :3, 3])[-1])
+        try:
+            motion = align(true_poses[:, :3, 3], poses[:, :3, 3], settings.alignment)
+        except InputError as error:
+            empty = SegmentErrors(
+                int(segment), len(times), float(times[-1] - times[0]), path, None, None, None, None, str(error)
+            )
+            segments.append(empty)
+            continue
+        aligned = motion.apply_to_poses(poses)
+        distance = np.linalg.norm(aligned[:, :3, 3] - true_poses[:, :3, 3], axis=1)
+        angle = rotation_angle_deg(np.swapaxes(true_poses[:, :3, :3], 1, 2) @ aligned[:, :3, :3])
+        ate = Spread.of(distance)
+        segments.append(
+            SegmentErrors(
+                segment=int(segment),
+                poses=len(times),
+                seconds=float(times[-1] - times[0]),
+                path_m=path,
+                scale=motion.scale,
+                ate_m=ate,
+                ate_percent=100.0 * ate.rmse / path if path > 0 else None,
+                rotation_deg=Spread.of(angle),
+                note="",
+            )
+        )
+        positions.append(distance)
+        angles.append(angle)
+        pieces.append((times, true_poses, poses, motion.scale))
+
+    windows = [(length, "s") for length in settings.time_windows]
+    windows += [(length, "m") for length in settings.distance_windows]
+    windows += [(length, "path") for length in settings.path_fractions]
+    path = sum(s.path_m for s in segments if s.ate_m is not None)
+    ate_all = Spread.of(np.concatenate(positions)) if positions else None
+    return TrajectoryErrors(
+        alignment=settings.alignment,
+        estimate_poses=int(estimate.valid.sum()),
+        truth_poses=int(clean.valid.sum()),
+        poses=len(pairs),
+        invalid_truth=tuple(float(time) for time in truth.times[unusable]),
+        path_m=path,
+        ate_m=ate_all,
+        ate_percent=100.0 * ate_all.rmse / path if ate_all and path > 0 else None,
+        rotation_deg=Spread.of(np.concatenate(angles)) if angles else None,
+        segments=tuple(segments),
+        relative=tuple(relative_errors(length, unit, pieces, settings.window_tolerance) for length, unit in windows),
+    )
+
+
+def _no_common_time(estimate: Trajectory, truth: Trajectory, max_difference: float, names: tuple[str, str]) -> str:
+    spans = [f"{t.times[t.valid][0]:.3f} to {t.times[t.valid][-1]:.3f} s" for t in (estimate, truth)]
+    return (
+        f"{names[0]} and {names[1]} have no common time: {spans[0]} against {spans[1]}, "
+        f"none within {max_difference:g} s; check the time stamps or raise --max-time-difference"
+    )
