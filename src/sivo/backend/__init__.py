@@ -1,0 +1,25 @@
+"""Bundle adjustment: the paper's objective, its solver, and triangulation with the poses held.
+
+Light to import; the compiled kernels load with the first use of `solve` and its like.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from sivo.backend.problem import BundleProblem, BundleResult
+from sivo.backend.settings import ObjectiveSettings, SolverSettings
+
+if TYPE_CHECKING:
+    from sivo.backend.solver import solve
+
+_LAZY = {"solve": "sivo.backend.solver"}
+
+__all__ = ["BundleProblem", "BundleResult", "ObjectiveSettings", "SolverSettings", "solve"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(importlib.import_module(_LAZY[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

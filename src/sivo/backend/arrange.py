@@ -1,0 +1,140 @@
+"""The problem as the kernels want it: observations sorted by point, free cameras numbered, memory laid out once."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sivo.backend.problem import BundleProblem
+from sivo.backend.settings import ObjectiveSettings
+from sivo.types import Float64, Int64
+
+BLOCK = 6  # parameters of a pose
+PADDED = 8  # a row of a 6x6 block in memory: full vector registers
+
+
+class Constants(NamedTuple):
+    """Numbers of the objective that every kernel needs."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    huber_width: float
+    depth_min: float
+    depth_max: float
+    depth_weight: float
+
+
+class Observations(NamedTuple):
+    """Observations sorted by point; within a point the free cameras first, in rising order, then the constant ones."""
+
+    order: Int64  # (O,) row in the caller's problem
+    camera: Int64  # (O,) row of the poses
+    free_camera: Int64  # (O,) number among the free cameras, or their count for a constant camera
+    keypoints: Float64  # (O, 2) pixels
+    weights: Float64  # (O,)
+    first: Int64  # (M + 1,) the observations of point j are first[j]:first[j + 1]
+    first_constant: Int64  # (M,) and those from here on are by constant cameras
+    point_is_free: NDArray[np.bool_]  # (M,)
+    camera_of_free: Int64  # (F,) row of the poses of each free camera
+
+
+class System(NamedTuple):
+    """The linearised problem and the reduced system; every array is filled anew in each iteration."""
+
+    in_camera: Float64  # (O, 3) R X + t
+    coupling: Float64  # (O, 3, 3) A R, with A the Hessian of the observation in the camera's frame
+    camera_hessian: Float64  # (F, 6, 8) upper triangles
+    camera_gradient: Float64  # (F, 6)
+    point_hessian: Float64  # (M, 6) xx, xy, xz, yy, yz, zz
+    point_gradient: Float64  # (M, 3)
+    point_root: Float64  # (M, 6) the inverse Cholesky factor of each damped point block
+    point_rhs: Float64  # (M, 3) that factor times the gradient
+    elimination: Float64  # (O, 3, 8) the rows of each camera-point block times the factor
+    reduced: Float64  # (F, F, 6, 8) blocks on and above the diagonal
+    factor: Float64  # (6 F, 6 F) upper Cholesky factor
+    camera_step: Float64  # (F, 6) translation, rotation
+    point_step: Float64  # (M, 3)
+
+
+def arrange(problem: BundleProblem, objective: ObjectiveSettings) -> tuple[Constants, Observations, System]:
+    """Sort the observations and lay out the memory."""
+    K = problem.K
+    constants = Constants(
+        float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]),
+        float(objective.huber_width), float(objective.depth_min), float(objective.depth_max),
+        float(objective.depth_weight),
+    )  # fmt: skip
+    camera_of_free = np.flatnonzero(~np.asarray(problem.fixed_cameras, np.bool_)).astype(np.int64)
+    free = len(camera_of_free)
+    free_number = np.full(len(problem.cam_from_world), free, np.int64)
+    free_number[camera_of_free] = np.arange(free)
+    camera_index = np.ascontiguousarray(problem.camera_index, np.int64)
+    point_index = np.ascontiguousarray(problem.point_index, np.int64)
+    order, first, first_constant = _sort(free_number[camera_index], point_index, free, len(problem.points))
+    observations = Observations(
+        order,
+        camera_index[order],
+        free_number[camera_index[order]],
+        np.ascontiguousarray(problem.keypoints[order], np.float64),
+        np.ascontiguousarray(problem.weights[order], np.float64),
+        first,
+        first_constant,
+        problem.free_points,
+        camera_of_free,
+    )
+    return constants, observations, _allocate(len(order), len(problem.points), free)
+
+
+def _allocate(observations: int, points: int, free: int) -> System:
+    return System(
+        in_camera=np.zeros((observations, 3)),
+        coupling=np.zeros((observations, 3, 3)),
+        camera_hessian=np.zeros((free, BLOCK, PADDED)),
+        camera_gradient=np.zeros((free, BLOCK)),
+        point_hessian=np.zeros((points, 6)),
+        point_gradient=np.zeros((points, 3)),
+        point_root=np.zeros((points, 6)),
+        point_rhs=np.zeros((points, 3)),
+        elimination=np.zeros((observations, 3, PADDED)),
+        reduced=np.zeros((free, free, BLOCK, PADDED)),
+        factor=np.zeros((BLOCK * free, BLOCK * free)),
+        camera_step=np.zeros((free, BLOCK)),
+        point_step=np.zeros((points, 3)),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _sort(free_camera, point, free, points):  # type: ignore[no-untyped-def]
+    """Counting sort by camera, then a stable one by point: (order, first of each point, first constant of each)."""
+    observations = len(point)
+    by_camera = np.empty(observations, np.int64)
+    slot = np.zeros(free + 2, np.int64)
+    for row in range(observations):
+        slot[free_camera[row] + 1] += 1
+    for camera in range(free + 1):
+        slot[camera + 1] += slot[camera]
+    for row in range(observations):
+        by_camera[slot[free_camera[row]]] = row
+        slot[free_camera[row]] += 1
+
+    first = np.zeros(points + 1, np.int64)
+    for row in range(observations):
+        first[point[row] + 1] += 1
+    for j in range(points):
+        first[j + 1] += first[j]
+    order = np.empty(observations, np.int64)
+    slot = first[:points].copy()
+    first_constant = first[:points].copy()
+    for k in range(observations):
+        row = by_camera[k]
+        j = point[row]
+        order[slot[j]] = row
+        slot[j] += 1
+        if free_camera[row] < free:
+            first_constant[j] += 1
+    return order, first, first_constant
