@@ -15,10 +15,13 @@ from numpy.typing import NDArray
 from sivo.errors import ConfigError, InputError
 from sivo.evaluation.relative import RelativeErrors, Spread, path_lengths, relative_errors
 from sivo.geometry.alignment import Similarity, align_points
-from sivo.geometry.se3 import nearest_rotation, rotation_angle_deg
+from sivo.geometry.se3 import rotation_angle_deg
+from sivo.sequences.association import nearest
+from sivo.sequences.trajectory_files import clean_poses
 from sivo.types import Float64, Int64, Trajectory
 
 ALIGNMENTS = ("sim3", "se3", "none")
+CLOCK_DIGITS = 1e-9  # seconds, rounding of a difference of time stamps
 
 
 @dataclass(frozen=True)
@@ -74,23 +77,10 @@ class TrajectoryErrors:
     relative: tuple[RelativeErrors, ...]  # by time, then by distance, then by share of the path
 
 
-def clean_truth(truth: Trajectory, tolerance: float = 0.02) -> tuple[Trajectory, NDArray[np.bool_]]:
-    """The truth with its rotations projected to SO(3), and which of its rows are unusable.
-
-    Pose files are orthonormal only to their printed digits (7-Scenes: 3e-4), so small deviations are repaired; rows
-    that are NaN or further than `tolerance` (Frobenius) from a rotation become NaN.
-
-    Returns:
-        The repaired trajectory and a mask (N,) of the rows that are NaN in it.
-    """
-    poses = np.array(truth.world_from_cam)
-    good = np.isfinite(poses).all(axis=(1, 2))
-    rotation = np.broadcast_to(np.eye(3), (len(poses), 3, 3)).copy()
-    rotation[good] = poses[good, :3, :3]
-    repaired = nearest_rotation(rotation)
-    good &= np.linalg.norm(repaired - rotation, axis=(1, 2)) <= tolerance
-    poses[:, :3, :3] = repaired
-    poses[~good] = np.nan
+def clean_truth(truth: Trajectory) -> tuple[Trajectory, NDArray[np.bool_]]:
+    """The truth with rotations projected to SO(3), and a mask (N,) of the rows that are NaN or not rigid, now NaN."""
+    poses = clean_poses(truth.world_from_cam)[0]
+    good: NDArray[np.bool_] = np.isfinite(poses).all(axis=(1, 2))
     return Trajectory(truth.times, poses, np.where(good, truth.segment, -1)), ~good
 
 
@@ -100,21 +90,10 @@ def associate(first: Float64, second: Float64, max_difference: float) -> Int64:
     Args:
         first, second: seconds, (N,) and (M,), increasing.
     """
-    if len(first) == 0 or len(second) == 0:
-        return np.zeros((0, 2), np.int64)
-    to_second, to_first = _nearest(second, first), _nearest(first, second)
-    rows = np.arange(len(first))
-    near = np.abs(second[to_second] - first) <= max_difference + 1e-9
-    keep = near & (to_first[to_second] == rows)
-    return np.stack([rows[keep], to_second[keep]], axis=1).astype(np.int64)
-
-
-def _nearest(times: Float64, queries: Float64) -> Int64:
-    after = np.clip(np.searchsorted(times, queries), 1, max(len(times) - 1, 1))
-    if len(times) == 1:
-        return np.zeros(len(queries), np.int64)
-    nearer_before = queries - times[after - 1] <= times[after] - queries
-    return np.where(nearer_before, after - 1, after).astype(np.int64)
+    to_second, to_first = (nearest(a, b, max_difference + CLOCK_DIGITS) for a, b in ((first, second), (second, first)))
+    rows = np.flatnonzero(to_second >= 0)
+    rows = rows[to_first[to_second[rows]] == rows]
+    return np.stack([rows, to_second[rows]], axis=1).astype(np.int64)
 
 
 def align(truth: Float64, estimate: Float64, alignment: str) -> Similarity:
