@@ -9,14 +9,28 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from sivo.backend.problem import BundleProblem, BundleResult
-from sivo.backend.settings import ObjectiveSettings, SolverSettings
+from sivo.backend.settings import ObjectiveSettings, SolverSettings, TriangulationSettings
 
 if TYPE_CHECKING:
     from sivo.backend.solver import solve
+    from sivo.backend.triangulation import Triangulation, triangulate_tracks
 
-_LAZY = {"solve": "sivo.backend.solver"}
+_LAZY = {
+    "solve": "sivo.backend.solver",
+    "Triangulation": "sivo.backend.triangulation",
+    "triangulate_tracks": "sivo.backend.triangulation",
+}
 
-__all__ = ["BundleProblem", "BundleResult", "ObjectiveSettings", "SolverSettings", "solve"]
+__all__ = [
+    "BundleProblem",
+    "BundleResult",
+    "ObjectiveSettings",
+    "SolverSettings",
+    "Triangulation",
+    "TriangulationSettings",
+    "solve",
+    "triangulate_tracks",
+]
 
 
 def __getattr__(name: str) -> Any:

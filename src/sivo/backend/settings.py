@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from sivo.errors import ConfigError
 
@@ -22,9 +23,7 @@ class ObjectiveSettings:
 
     def __post_init__(self) -> None:
         if not self.huber_width > 0:
-            raise ConfigError(
-                f"huber_width={self.huber_width}: must be positive (use a large value for no robust loss)"
-            )
+            raise ConfigError(f"huber_width={self.huber_width}: must be positive (large: no robust loss)")
         if not self.depth_min <= self.depth_max:
             raise ConfigError(f"depth_min={self.depth_min} is above depth_max={self.depth_max}: swap them")
         if not self.depth_weight >= 0:
@@ -50,3 +49,19 @@ class SolverSettings:
             raise ConfigError("damping: needs 0 < min_damping <= initial_damping <= max_damping")
         if not self.min_diagonal > 0:
             raise ConfigError(f"min_diagonal={self.min_diagonal}: must be positive")
+
+
+@dataclass(frozen=True)
+class TriangulationSettings:
+    """How the points of tracks are found while the poses are held."""
+
+    loss: Literal["huber", "geman_mcclure"] = "huber"  # the second lets go of what does not fit (docs/labels.md)
+    loss_width: float = 1.0  # pixels
+    max_iterations: int = 10  # of the refinement by re-weighted least squares
+    min_parallax_deg: float = 1.0  # smallest angle between two of a point's rays for it to count as found
+
+    def __post_init__(self) -> None:
+        if self.loss not in ("huber", "geman_mcclure"):
+            raise ConfigError(f"triangulation loss={self.loss!r}: must be huber or geman_mcclure")
+        if not self.loss_width > 0:
+            raise ConfigError(f"triangulation loss_width={self.loss_width}: must be positive")

@@ -1,0 +1,64 @@
+"""Compiling the kernels ahead of time, so that a progress line can say so.
+
+Numba compiles a kernel when it is first called and caches the machine code beside the source (or in the user's cache
+folder, or where NUMBA_CACHE_DIR says), so this takes seconds once per installation and a fraction of one afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from sivo.backend.problem import BundleProblem
+
+
+def kernels_are_cached() -> bool:
+    """Whether a compiled copy of the solver is on disk; it may still be stale, which only costs a compilation."""
+    from sivo.backend import reduced, triangulation_kernels
+
+    kernels = (reduced.solve_reduced, triangulation_kernels.triangulate_all)
+    return all(any(Path(kernel.stats.cache_path).glob(f"*{kernel.__name__}-*.nbi")) for kernel in kernels)
+
+
+def compile_kernels(progress: Callable[[str], None] | None = None) -> None:
+    """Run every kernel once on a tiny problem.
+
+    Args:
+        progress: is told, in a few words, before a compilation that takes seconds; not called when all is cached.
+    """
+    if progress is not None and not kernels_are_cached():
+        progress("compiling the solver (once, about 15 s)")
+    from sivo.backend.solver import solve
+    from sivo.backend.triangulation import triangulate_tracks
+
+    problem = tiny_problem()
+    solve(problem)
+    order = np.argsort(problem.point_index, kind="stable")
+    counts = np.bincount(problem.point_index, minlength=len(problem.points))
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    triangulate_tracks(
+        problem.keypoints[order], problem.camera_index[order], offsets, problem.cam_from_world, problem.K
+    )
+
+
+def tiny_problem() -> BundleProblem:
+    """Three cameras on a line before nine points, one of the cameras constant; the points start too near."""
+    K = np.array([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
+    cam_from_world = np.tile(np.eye(4), (3, 1, 1))
+    cam_from_world[:, 0, 3] = (0.0, -0.1, -0.2)
+    points = np.array([[0.1 * (j % 3), 0.1 * (j // 3), 1.0 + 0.05 * j] for j in range(9)])
+    camera_index, point_index = np.repeat(np.arange(3), 9), np.tile(np.arange(9), 3)
+    in_camera = points[point_index] + cam_from_world[camera_index, :3, 3]
+    keypoints = 100.0 * in_camera[:, :2] / in_camera[:, 2:] + 50.0
+    return BundleProblem(
+        cam_from_world,
+        0.9 * points,
+        camera_index,
+        point_index,
+        keypoints,
+        np.ones(27),
+        K,
+        np.array([True, False, False]),
+    )
