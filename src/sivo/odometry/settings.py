@@ -1,0 +1,75 @@
+"""All settings of the odometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from sivo.backend.settings import ObjectiveSettings, SolverSettings
+from sivo.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class MatchingSettings:
+    """Matching of consecutive frames (paper, "Point Tracks")."""
+
+    max_distance: float = 0.7  # tau on unit descriptors; binary ones use the equivalent share of bits
+    refind_radius: float = 8.0  # pixels at 640 wide: how far from its projection a lost map point is looked for
+    refind_frames: int = 60  # map points not seen for longer than this are not looked for
+
+
+@dataclass(frozen=True)
+class StartSettings:
+    """When two views are good enough to start a map (robust mode)."""
+
+    min_common_tracks: int = 60
+    max_waiting: int = 300  # frames kept while waiting for enough parallax
+    epipolar_error: float = 1.0  # pixels, RANSAC threshold of the essential matrix and of the homography
+    max_homography_ratio: float = 0.7  # homography inliers / essential inliers; more is too little parallax
+    plane_ratio: float = 0.95  # from here on the scene is a plane, and its homography is decomposed
+    min_parallax_deg: float = 1.0
+    min_points: int = 30  # over the minimum parallax
+    min_inlier_share: float = 0.5  # essential inliers of the matches
+    max_mean_error: float = 1.2  # pixels, after adjustment and pruning
+
+
+@dataclass(frozen=True)
+class WindowSettings:
+    """Which poses the window adjusts."""
+
+    recent: int = 15  # last consecutive frames, free
+    keyframes: int = 15  # older keyframes, free
+    constants: int = 30  # still older keyframes, kept as constants with their observations
+    keyframe_motion: float = 0.05  # median pixel motion since the last keyframe, as a share of the image width
+    keyframe_shared: float = 0.6  # or: share of the last keyframe's map points still seen
+    keyframe_interval: int = 15  # or: frames since the last keyframe
+    max_error: float = 3.0  # pixels; observations over it are dropped, and the window is solved again
+    paper_poses: int = 30  # N_last, of the mode `paper`
+
+
+@dataclass(frozen=True)
+class TrackingLossSettings:
+    """When a frame, and when a segment, counts as lost."""
+
+    min_inliers: int = 12
+    min_inlier_share: float = 0.1
+    max_lost_frames: int = 10  # after this many frames without a pose the segment ends
+
+
+@dataclass(frozen=True)
+class OdometrySettings:
+    """Settings of `VisualOdometry`."""
+
+    initialisation: str = "robust"  # `robust`, or `paper`: previous pose, unit depth, nothing else
+    seed: int = 0
+    matching: MatchingSettings = field(default_factory=MatchingSettings)
+    start: StartSettings = field(default_factory=StartSettings)
+    window: WindowSettings = field(default_factory=WindowSettings)
+    loss: TrackingLossSettings = field(default_factory=TrackingLossSettings)
+    objective: ObjectiveSettings = field(default_factory=lambda: ObjectiveSettings(depth_weight=0.0))
+    solver: SolverSettings = field(default_factory=lambda: SolverSettings(max_iterations=8, relative_decrease=1e-3))
+    paper_objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)  # of the mode `paper`
+    paper_solver: SolverSettings = field(default_factory=lambda: SolverSettings(100, relative_decrease=1e-6))
+
+    def __post_init__(self) -> None:
+        if self.initialisation not in ("robust", "paper"):
+            raise ConfigError(f"initialisation {self.initialisation!r}: choose `robust` or `paper`")

@@ -1,0 +1,110 @@
+"""The visual odometry loop: detect, match, extend tracks, optimise the window, slide."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from sivo.frontend import Frontend
+from sivo.geometry.camera import Camera
+from sivo.odometry.journal import Event, FinalView, Journal, Segment
+from sivo.odometry.paper import PaperMapper
+from sivo.odometry.robust import RobustMapper
+from sivo.odometry.settings import OdometrySettings
+from sivo.odometry.view import View
+from sivo.tracking.connect import TrackChain
+from sivo.tracking.matching import distance_threshold, match_units, unit_descriptors
+from sivo.types import Features, Frame, SparseMap, Trajectory
+
+
+class VisualOdometry:
+    """Monocular visual odometry (the whole paper but its training), up to scale.
+
+    Args:
+        frontend: gives the features of an image.
+        camera: pinhole camera of the frames.
+        settings: all numbers.
+        use_stability: weigh observations with the frontend's stability (w_ij), or with 1.
+        on_final: called with each frame that nothing can change any more.
+    """
+
+    def __init__(
+        self,
+        frontend: Frontend,
+        camera: Camera,
+        settings: OdometrySettings | None = None,
+        use_stability: bool = True,
+        on_final: Callable[[FinalView], None] | None = None,
+    ) -> None:
+        self._frontend = frontend
+        self._camera = camera
+        self._settings = settings or OdometrySettings()
+        self._use_stability = use_stability
+        self._journal = Journal(camera, on_final)
+        self._chain = TrackChain()
+        self._previous: View | None = None
+        self._mapper: RobustMapper | PaperMapper | None = None
+        self._count = 0
+
+    def track(self, frame: Frame) -> View:
+        """Process the next frame; its view carries the pose found so far (`cam_from_world`, None while lost)."""
+        return self.track_features(self._frontend(frame.image), frame.time)
+
+    def track_features(self, features: Features, time: float) -> View:
+        """As `track`, with the features of the frame at hand."""
+        view = self._extend_tracks(features, time)
+        if self._mapper is None:
+            mapper = RobustMapper if self._settings.initialisation == "robust" else PaperMapper
+            self._mapper = mapper(self._camera, self._settings, self._max_distance(features), self._journal)
+        self._mapper.track(view)
+        self._previous = view
+        self._count += 1
+        return view
+
+    def finish(self) -> None:
+        """The sequence is over: all poses and points become final."""
+        if self._mapper is not None:
+            self._mapper.finish()
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Poses that are final; all of them after `finish`."""
+        return self._journal.trajectory
+
+    @property
+    def map(self) -> SparseMap:
+        """Points of finished segments; all of them after `finish`."""
+        return self._journal.map
+
+    @property
+    def segments(self) -> Sequence[Segment]:
+        """Finished segments."""
+        return self._journal.segments
+
+    @property
+    def events(self) -> Sequence[Event]:
+        """What went wrong where."""
+        return self._journal.events
+
+    def _extend_tracks(self, features: Features, time: float) -> View:
+        """Connect the dots with the previous frame."""
+        descriptors = unit_descriptors(features)
+        if self._previous is None:
+            tracks = self._chain.start(len(features))
+        else:
+            matches = match_units(self._previous.descriptors, descriptors, self._max_distance(features))
+            tracks = self._chain.extend(self._previous.tracks, matches, len(features))
+        weights = features.weights() if self._use_stability else np.ones(len(features))
+        return View(
+            position=self._count,
+            time=time,
+            keypoints=features.keypoints.astype(np.float64),
+            descriptors=descriptors,
+            weights=weights.astype(np.float64),
+            tracks=tracks,
+            points=np.full(len(features), -1, np.int64),
+        )
+
+    def _max_distance(self, features: Features) -> float:
+        return distance_threshold(features, self._settings.matching.max_distance)
