@@ -1,0 +1,107 @@
+"""From the network's maps to keypoints, descriptors and stability, in NumPy (paper, "Convolutional Frontend").
+
+Conventions: the centre of the top-left pixel is (0, 0), and the cell (i, j) is centred on (8j + 3.5, 8i + 3.5).
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit
+
+from sivo.frontend.architecture import CELL
+from sivo.frontend.runtime import NetworkMaps
+from sivo.frontend.settings import NetworkSettings
+from sivo.types import Features, Float32, Int64
+
+
+def decode(maps: NetworkMaps, row: int, height: int, width: int, settings: NetworkSettings) -> Features:
+    """Features of image `row` of the batch, best score first.
+
+    Args:
+        maps: of images that were padded at the right and the bottom.
+        row: position in the batch.
+        height, width: of the image before padding; keypoints are found only within.
+    """
+    heat = maps.heat[row, :height, :width]
+    pixels = find_keypoints(heat, settings)
+    scores = heat[pixels[:, 1], pixels[:, 0]]
+    keypoints = (
+        refine(heat, pixels, settings.subpixel_radius) if settings.subpixel_radius else pixels.astype(np.float32)
+    )
+    descriptors = sample_descriptors(maps.descriptors[row], keypoints)
+    stability = None
+    if maps.stability_logits is not None:
+        stability = stability_probability(_sample(maps.stability_logits[row], keypoints))
+    return Features(keypoints, descriptors, scores, stability)
+
+
+def find_keypoints(heat: Float32, settings: NetworkSettings) -> Int64:
+    """Pixels (N, 2) x, y of the best local maxima of a heat map (H, W), best first; ties in reading order."""
+    border = settings.border
+    size = 2 * settings.nms_radius + 1
+    best_around = cv2.dilate(heat, np.ones((size, size), np.uint8))  # outside the image counts as minus infinity
+    kept = (heat == best_around) & (heat > settings.threshold)
+    inner = kept[border : heat.shape[0] - border, border : heat.shape[1] - border]
+    y, x = np.nonzero(inner)
+    y, x = y + border, x + border
+    best_first = np.argsort(-heat[y, x], kind="stable")[: settings.max_keypoints]
+    return np.stack([x[best_first], y[best_first]], axis=1).astype(np.int64)
+
+
+def refine(heat: Float32, pixels: Int64, radius: int) -> Float32:
+    """Keypoints (N, 2): the centre of mass of the heat map in the square of `radius` around each pixel (N, 2)."""
+    padded = np.pad(heat, radius)
+    steps = np.arange(2 * radius + 1)
+    patches = padded[pixels[:, 1, None, None] + steps[:, None], pixels[:, 0, None, None] + steps]  # (N, rows, columns)
+    mass = patches.sum(axis=(1, 2))
+    offset_x = patches.sum(axis=1) @ (steps - radius).astype(np.float32) / mass
+    offset_y = patches.sum(axis=2) @ (steps - radius).astype(np.float32) / mass
+    return (pixels + np.stack([offset_x, offset_y], axis=1)).astype(np.float32)
+
+
+def sample_descriptors(cells: Float32, keypoints: Float32) -> Float32:
+    """Unit descriptors (N, D) at keypoints (N, 2): cells (Hc, Wc, D) normalised, interpolated, normalised again."""
+    corners, weights = _corners(cells, keypoints)
+    weights = weights / np.maximum(np.linalg.norm(corners, axis=2), 1e-12)
+    sampled = np.matmul(weights[:, None], corners)[:, 0]
+    return np.asarray(sampled / np.maximum(np.linalg.norm(sampled, axis=1, keepdims=True), 1e-12))
+
+
+def stability_probability(logits: Float32) -> Float32:
+    """Softmax over the last axis (..., 2): the probability of the second class, "stable"."""
+    return np.asarray(expit(logits[..., 1] - logits[..., 0]), np.float32)
+
+
+def stability_map(logits: Float32, height: int, width: int) -> Float32:
+    """Probability (height, width) that a keypoint at a pixel is stable, from logits (Hc, Wc, 2).
+
+    As the paper has it: the logits are interpolated, then the softmax taken.
+    """
+    size = (logits.shape[1] * CELL, logits.shape[0] * CELL)
+    # cv2.resize takes pixel areas to pixel areas: its centre of cell j is 8j + 3.5, as ours
+    pixels = cv2.resize(np.ascontiguousarray(logits), size, interpolation=cv2.INTER_LINEAR)
+    return stability_probability(pixels[:height, :width])
+
+
+def _sample(cells: Float32, keypoints: Float32) -> Float32:
+    corners, weights = _corners(cells, keypoints)
+    return np.matmul(weights[:, None], corners)[:, 0]
+
+
+def _corners(cells: Float32, keypoints: Float32) -> tuple[Float32, Float32]:
+    """The four cells (N, 4, C) around each keypoint and their bilinear weights (N, 4); beyond the edge the edge."""
+    rows, columns = cells.shape[:2]
+    x0, x1, along_x = _neighbours(keypoints[:, 0], columns)
+    y0, y1, along_y = _neighbours(keypoints[:, 1], rows)
+    corners = cells[np.stack([y0, y0, y1, y1], axis=1), np.stack([x0, x1, x0, x1], axis=1)]
+    left, top = 1 - along_x, 1 - along_y
+    weights = np.stack([top * left, top * along_x, along_y * left, along_y * along_x], axis=1)
+    return corners, weights
+
+
+def _neighbours(pixels: Float32, cells: int) -> tuple[Int64, Int64, NDArray[np.float32]]:
+    position = np.clip((pixels - (CELL - 1) / 2) / CELL, 0, cells - 1)
+    before = np.minimum(position.astype(np.int64), max(cells - 2, 0))
+    return before, np.minimum(before + 1, cells - 1), (position - before).astype(np.float32)
