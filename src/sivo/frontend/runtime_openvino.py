@@ -50,7 +50,7 @@ class OpenVinoRuntime:
         return NetworkMaps(maps[0][:, 0], maps[1], maps[2] if len(maps) > 2 else None)
 
 
-def activation_maxima(weights: Weights, images: Float32, quantile: float) -> dict[str, float]:
+def activation_ranges(weights: Weights, images: Float32, quantile: float) -> dict[str, float]:
     """The `quantile` of each quantised convolution's inputs over (B, 1, H, W) images, by the convolution's name."""
     graph = _Graph(weights, {})
     model = graph.model(images.shape, taps=True)
