@@ -17,6 +17,8 @@ from sivo.errors import SivoError
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("run", "visual odometry on one sequence: trajectory, map, tracks"),
     "show": ("show", "pictures of a finished run"),
+    "weights": ("weights", "import public weights, prepare weights for int8, print a model card"),
+    "export": ("export", "what other tools read: ONNX"),
     "config": ("config", "print all settings of a command as YAML"),
 }
 
