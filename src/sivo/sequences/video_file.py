@@ -154,20 +154,15 @@ def _index(path: Path) -> tuple[Int64, Int64]:
     if not stamps:
         return nothing, nothing
     increasing, first = np.unique(np.array(stamps, np.int64), return_index=True)
-    if _decoded_stamps(path, _CHECKED) == increasing[:_CHECKED].tolist():
+    if len(increasing) == len(stamps) and _decoded_stamps(path, _CHECKED) == increasing[:_CHECKED].tolist():
         keys = np.flatnonzero(np.array(is_key)[first])
         return increasing, np.union1d(keys, [0]).astype(np.int64)
     decoded = np.array(_decoded_stamps(path), np.int64)
-    if len(decoded) and (np.diff(decoded) <= 0).any():
-        decoded = np.rint(np.arange(len(decoded)) * 1e6 / _nominal_rate(path)).astype(np.int64)
+    steps = np.diff(decoded)
+    if (steps <= 0).any():
+        step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1e6 / DEFAULT_FPS
+        decoded = np.rint(np.arange(len(decoded)) * step).astype(np.int64)
     return decoded, nothing
-
-
-def _nominal_rate(path: Path) -> float:
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    rate = float(capture.get(cv2.CAP_PROP_FPS))
-    capture.release()
-    return rate if 0.1 < rate < 1000 else DEFAULT_FPS
 
 
 def _decoded_stamps(path: Path, limit: int | None = None) -> list[int]:
