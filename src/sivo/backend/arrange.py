@@ -12,8 +12,10 @@ from sivo.backend.problem import BundleProblem
 from sivo.backend.settings import ObjectiveSettings
 from sivo.types import Float64, Int64
 
-BLOCK = 6  # parameters of a pose
-PADDED = 8  # a row of a 6x6 block in memory: full vector registers
+POSE = 6  # parameters of a pose
+COLUMN = 8  # numbers that a camera takes in a row of the reduced system: six, padded to whole vector registers
+CHUNK = 32  # cameras in a piece of such a row
+STRIDE = CHUNK * COLUMN + 8  # from a row to the next; known to the compiler, and no power of two, for the cache's sake
 
 
 class Constants(NamedTuple):
@@ -39,6 +41,8 @@ class Observations(NamedTuple):
     weights: Float64  # (O,)
     first: Int64  # (M + 1,) the observations of point j are first[j]:first[j + 1]
     first_constant: Int64  # (M,) and those from here on are by constant cameras
+    first_of_camera: Int64  # (O,) the first observation of this point by this camera: itself, unless it saw it twice
+    run_end: Int64  # (O,) end of the consecutive cameras, within a chunk, that start here
     point_is_free: NDArray[np.bool_]  # (M,)
     camera_of_free: Int64  # (F,) row of the poses of each free camera
 
@@ -48,15 +52,14 @@ class System(NamedTuple):
 
     in_camera: Float64  # (O, 3) R X + t
     coupling: Float64  # (O, 3, 3) A R, with A the Hessian of the observation in the camera's frame
-    camera_hessian: Float64  # (F, 6, 8) upper triangles
+    camera_hessian: Float64  # (F, 6, 6) upper triangles
     camera_gradient: Float64  # (F, 6)
     point_hessian: Float64  # (M, 6) xx, xy, xz, yy, yz, zz
     point_gradient: Float64  # (M, 3)
     point_root: Float64  # (M, 6) the inverse Cholesky factor of each damped point block
     point_rhs: Float64  # (M, 3) that factor times the gradient
-    elimination: Float64  # (O, 3, 8) the rows of each camera-point block times the factor
-    reduced: Float64  # (F, F, 6, 8) blocks on and above the diagonal
-    factor: Float64  # (6 F, 6 F) upper Cholesky factor
+    elimination: Float64  # (3, 8 O) each coupling block times the transpose of that factor, one row per column of it
+    reduced: Float64  # flat (F, chunks, 6, STRIDE): the blocks on and above the diagonal, then their Cholesky factor
     camera_step: Float64  # (F, 6) translation, rotation
     point_step: Float64  # (M, 3)
 
@@ -75,7 +78,9 @@ def arrange(problem: BundleProblem, objective: ObjectiveSettings) -> tuple[Const
     free_number[camera_of_free] = np.arange(free)
     camera_index = np.ascontiguousarray(problem.camera_index, np.int64)
     point_index = np.ascontiguousarray(problem.point_index, np.int64)
-    order, first, first_constant = _sort(free_number[camera_index], point_index, free, len(problem.points))
+    order, first, first_constant, first_of_camera, run_end = _sort(
+        free_number[camera_index], point_index, free, len(problem.points)
+    )
     observations = Observations(
         order,
         camera_index[order],
@@ -84,6 +89,8 @@ def arrange(problem: BundleProblem, objective: ObjectiveSettings) -> tuple[Const
         np.ascontiguousarray(problem.weights[order], np.float64),
         first,
         first_constant,
+        first_of_camera,
+        run_end,
         problem.free_points,
         camera_of_free,
     )
@@ -94,23 +101,22 @@ def _allocate(observations: int, points: int, free: int) -> System:
     return System(
         in_camera=np.zeros((observations, 3)),
         coupling=np.zeros((observations, 3, 3)),
-        camera_hessian=np.zeros((free, BLOCK, PADDED)),
-        camera_gradient=np.zeros((free, BLOCK)),
+        camera_hessian=np.zeros((free, POSE, POSE)),
+        camera_gradient=np.zeros((free, POSE)),
         point_hessian=np.zeros((points, 6)),
         point_gradient=np.zeros((points, 3)),
         point_root=np.zeros((points, 6)),
         point_rhs=np.zeros((points, 3)),
-        elimination=np.zeros((observations, 3, PADDED)),
-        reduced=np.zeros((free, free, BLOCK, PADDED)),
-        factor=np.zeros((BLOCK * free, BLOCK * free)),
-        camera_step=np.zeros((free, BLOCK)),
+        elimination=np.zeros((3, COLUMN * observations)),
+        reduced=np.zeros(free * -(-free // CHUNK) * POSE * STRIDE),
+        camera_step=np.zeros((free, POSE)),
         point_step=np.zeros((points, 3)),
     )
 
 
 @njit(cache=True, nogil=True)
 def _sort(free_camera, point, free, points):  # type: ignore[no-untyped-def]
-    """Counting sort by camera, then a stable one by point: (order, first of each point, first constant of each)."""
+    """Counting sort by camera, then a stable one by point; the fields of `Observations` that follow from it."""
     observations = len(point)
     by_camera = np.empty(observations, np.int64)
     slot = np.zeros(free + 2, np.int64)
@@ -137,4 +143,14 @@ def _sort(free_camera, point, free, points):  # type: ignore[no-untyped-def]
         slot[j] += 1
         if free_camera[row] < free:
             first_constant[j] += 1
-    return order, first, first_constant
+
+    first_of_camera, run_end = np.arange(observations), np.arange(1, observations + 1)
+    for j in range(points):
+        for k in range(first[j] + 1, first_constant[j]):
+            if free_camera[order[k]] == free_camera[order[k - 1]]:
+                first_of_camera[k] = first_of_camera[k - 1]
+        for k in range(first_constant[j] - 2, first[j] - 1, -1):
+            camera = free_camera[order[k + 1]]
+            if camera == free_camera[order[k]] + 1 and camera % CHUNK != 0:
+                run_end[k] = run_end[k + 1]
+    return order, first, first_constant, first_of_camera, run_end
