@@ -6,6 +6,7 @@ stability head.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,7 +84,9 @@ def read_public_file(path: Path) -> dict[str, NDArray[Any]]:
             import torch
         except ImportError:
             raise MissingExtraError("reading a torch file", "train") from None
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of pickle protocols, when the file is no torch file at all
+            checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except MissingExtraError:
         raise
     except Exception as error:  # torch and safetensors raise many kinds, from RuntimeError to UnpicklingError

@@ -60,8 +60,7 @@ class NetworkFrontend:
         Raises:
             InputError: an image of another shape or type, or with values that are not finite.
         """
-        height, width = image.shape[:2]
-        return decode(self._run([image]), 0, height, width, self.settings)
+        return self._features(self._run([image]), 0, image)
 
     def batch(self, images: Sequence[Image]) -> list[Features]:
         """Features of images of one size, in one pass of the network; memory grows with their number."""
@@ -70,14 +69,13 @@ class NetworkFrontend:
         sizes = {image.shape[:2] for image in images}
         if len(sizes) > 1:
             raise InputError(f"a batch needs images of one size, these have {sorted(sizes)}; pass them one by one")
-        (height, width) = sizes.pop()
         maps = self._run(images)
-        return [decode(maps, row, height, width, self.settings) for row in range(len(images))]
+        return [self._features(maps, row, image) for row, image in enumerate(images)]
 
     def heat_map(self, image: Image) -> Float32:
         """Probability (H, W) that a pixel is a keypoint, before non-maximum suppression."""
-        height, width = image.shape[:2]
-        return self._run([image]).heat[0, :height, :width].copy()
+        heat = self._run([image]).heat[0]
+        return heat[: image.shape[0], : image.shape[1]].copy()
 
     def stability_map(self, image: Image) -> Float32:
         """Probability (H, W) that a keypoint at a pixel is stable (paper, "Stability Classifier Head").
@@ -85,11 +83,14 @@ class NetworkFrontend:
         Raises:
             InputError: the weights have no stability head.
         """
-        height, width = image.shape[:2]
         logits = self._run([image]).stability_logits
         if logits is None:
             raise InputError(f"{self.name}: these weights have no stability head; use weights that were adapted to VO")
-        return stability_map(logits[0], height, width)
+        return stability_map(logits[0], *image.shape[:2])
+
+    def _features(self, maps: NetworkMaps, row: int, image: Image) -> Features:
+        height, width = image.shape[:2]
+        return decode(maps, row, height, width, self.settings)
 
     def _run(self, images: Sequence[Image]) -> NetworkMaps:
         return self._runtime(np.stack([prepare(image) for image in images])[:, None])

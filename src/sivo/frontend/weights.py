@@ -143,11 +143,9 @@ def load_weights(path: Path) -> Weights:
     if header is None:
         raise InputError(f"{path}: safetensors without a sivo model card; convert it with `sivo weights import`")
     try:
-        card = config.from_dict(ModelCard, json.loads(header), where=str(path))
+        card = config.from_dict(ModelCard, json.loads(header), where="model card")
     except (ValueError, ConfigError) as error:
-        raise InputError(
-            f"{path}: its model card is not readable ({error}); made by another version of sivo?"
-        ) from None
+        raise InputError(f"{path}: not readable, {error}; was it made by another version of sivo?") from None
     _check_tensors(path, tensors, card.architecture)
     return Weights(card, tensors)
 

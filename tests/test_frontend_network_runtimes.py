@@ -1,0 +1,208 @@
+"""The runtimes against each other: OpenVINO, torch, int8, and the exported ONNX file in ONNX Runtime."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from network_examples import TINY, lit_pixel_weights, random_weights
+from sivo.cli.main import main
+from sivo.errors import ConfigError, InputError
+from sivo.frontend.architecture import ARCHITECTURES
+from sivo.frontend.calibration import calibrate
+from sivo.frontend.network import NetworkFrontend, prepare
+from sivo.frontend.settings import NetworkSettings
+from sivo.frontend.weights import save_weights
+
+LAYOUTS = ("none", "before_relu", "after_relu")
+# Largest difference between float32 runtimes, relative to the largest value of the map.
+TOLERANCE = 1e-5
+
+
+def picture(height: int = 101, width: int = 133, seed: int = 0) -> np.ndarray:
+    noise = np.random.default_rng(seed).integers(0, 256, (height, width), np.uint8)
+    return cv2.GaussianBlur(noise, (5, 5), 1)
+
+
+@pytest.mark.parametrize("normalisation", LAYOUTS)
+def test_openvino_agrees_with_torch(normalisation):
+    pytest.importorskip("torch")
+    weights = random_weights(dataclasses.replace(TINY, normalisation=normalisation))
+    openvino = NetworkFrontend(weights)
+    torch = NetworkFrontend(weights, NetworkSettings(runtime="torch"))
+    assert openvino.runtime.name == "openvino-float32"
+    assert torch.runtime.name == "torch-cpu-float32"
+    images = np.stack([prepare(picture(seed=seed)) for seed in (0, 1)])[:, None]
+    for ours, theirs in zip(openvino.runtime(images), torch.runtime(images), strict=True):
+        assert ours.shape == theirs.shape
+        assert np.std(theirs) > 0
+        np.testing.assert_allclose(ours, theirs, atol=TOLERANCE * np.abs(theirs).max())
+
+
+def test_the_unfolded_network_agrees_too():
+    torch = pytest.importorskip("torch")
+    from sivo.frontend.runtime_torch import load_network
+    from sivo.frontend.superpoint import heat_map
+
+    weights = random_weights()
+    image = prepare(picture())[None, None]
+    with torch.inference_mode():
+        output = load_network(weights)(torch.from_numpy(image))
+        heat = heat_map(output.detector_logits).numpy()
+    maps = NetworkFrontend(weights).runtime(image)
+    np.testing.assert_allclose(maps.heat, heat, atol=TOLERANCE * heat.max())
+    np.testing.assert_allclose(
+        maps.descriptors, output.descriptors.permute(0, 2, 3, 1).numpy(), atol=1e-5 * output.descriptors.abs().max()
+    )
+
+
+def test_parameter_counts():
+    torch = pytest.importorskip("torch")
+    from sivo.frontend.superpoint import SuperPoint
+
+    def count(architecture):
+        return sum(values.numel() for values in SuperPoint(architecture, batch_norm=False).parameters())
+
+    paper, small = ARCHITECTURES["superpoint"], ARCHITECTURES["superpoint-small"]
+    assert count(dataclasses.replace(paper, stability=False)) == 1_300_865  # the published SuperPoint
+    assert count(paper) == 1_300_865 + (128 * 9 + 1) * 256 + (256 + 1) * 2
+    assert count(small) == 404_067
+    output = SuperPoint(paper)(torch.zeros(1, 1, 16, 24))
+    assert [tuple(maps.shape) for maps in output] == [(1, 65, 2, 3), (1, 256, 2, 3), (1, 2, 2, 3)]
+    with pytest.raises(ValueError, match="multiples of 8"):
+        SuperPoint(small)(torch.zeros(1, 1, 17, 24))
+
+
+def test_multiplications_are_counted_as_torch_counts_them():
+    torch = pytest.importorskip("torch")
+    from torch.utils.flop_counter import FlopCounterMode
+
+    from sivo.frontend.superpoint import SuperPoint
+
+    with FlopCounterMode(display=False) as counter, torch.inference_mode():
+        SuperPoint(TINY, batch_norm=False)(torch.zeros(1, 1, 40, 64))
+    assert 2 * TINY.multiplications(37, 63) == counter.get_total_flops()
+
+
+def test_same_image_same_features_and_batches_are_single_images():
+    frontend = NetworkFrontend(random_weights())
+    images = [picture(seed=seed) for seed in range(3)]
+    single = [frontend(image) for image in images]
+    for one, other in zip(single, NetworkFrontend(random_weights()).batch(images), strict=True):
+        assert len(one) > 20
+        np.testing.assert_array_equal(one.keypoints, other.keypoints)
+        np.testing.assert_allclose(one.descriptors, other.descriptors, atol=1e-5)
+    again = frontend(images[0])
+    for field in dataclasses.fields(again):
+        np.testing.assert_array_equal(getattr(again, field.name), getattr(single[0], field.name))
+    assert (np.diff(again.scores) <= 0).all()
+    np.testing.assert_allclose(np.linalg.norm(again.descriptors, axis=1), 1, atol=1e-5)
+    assert frontend.batch([]) == []
+    with pytest.raises(InputError, match="one size"):
+        frontend.batch([images[0], images[0][:50]])
+
+
+def test_features_of_an_earlier_call_survive_the_next():
+    frontend = NetworkFrontend(random_weights())
+    first = frontend(picture())
+    kept = [np.copy(getattr(first, field.name)) for field in dataclasses.fields(first)]
+    heat = frontend.heat_map(picture())
+    kept_heat = heat.copy()
+    frontend(picture(seed=9))
+    for field, values in zip(dataclasses.fields(first), kept, strict=True):
+        np.testing.assert_array_equal(getattr(first, field.name), values)
+    np.testing.assert_array_equal(heat, kept_heat)
+
+
+def test_int8_stays_close_once_calibrated():
+    weights = random_weights(dataclasses.replace(TINY, encoder=(16,) * 8, head=32))
+    with pytest.raises(ConfigError, match="calibrate"):
+        NetworkFrontend(weights, NetworkSettings(precision="int8"))
+    calibrated = calibrate(weights, [picture(seed=seed) for seed in range(5)])
+    int8, float32 = NetworkFrontend(calibrated), NetworkFrontend(calibrated, NetworkSettings(precision="float32"))
+    assert (int8.runtime.name, float32.runtime.name) == ("openvino-int8", "openvino-float32")
+    image = prepare(picture(seed=7))[None, None]
+    a, b = int8.runtime(image).descriptors[0], float32.runtime(image).descriptors[0]
+    assert not np.array_equal(a, b)
+    cosine = (a * b).sum(-1) / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1)
+    assert np.median(cosine) > 0.999
+
+
+def test_int8_refuses_what_it_cannot_run():
+    with pytest.raises(InputError, match="at least one image"):
+        calibrate(random_weights(), [])
+    with pytest.raises(InputError, match="after the ReLU"):
+        calibrate(random_weights(dataclasses.replace(TINY, normalisation="after_relu")), [picture()])
+
+
+@pytest.mark.parametrize("settings", [{"precision": "float16"}, {"runtime": "torch", "precision": "int8"}])
+def test_precisions_that_a_runtime_lacks_are_refused(settings):
+    pytest.importorskip("torch")
+    with pytest.raises(ConfigError, match="precision"):
+        NetworkFrontend(random_weights(), NetworkSettings(**settings))
+
+
+def test_inference_needs_no_torch(tmp_path):
+    path = tmp_path / "tiny.safetensors"
+    weights = random_weights()
+    save_weights(path, weights.tensors, weights.card)
+    program = f"""
+import sys
+sys.modules["torch"] = sys.modules["onnx"] = None
+import numpy as np
+from sivo.frontend.registry import load_frontend
+features = load_frontend({str(path)!r}, max_keypoints=7, border=2)(np.random.default_rng(0).random((40, 50)))
+assert len(features) == 7, len(features)
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+@pytest.mark.parametrize("normalisation", LAYOUTS)
+@pytest.mark.parametrize("subpixel_radius", [0, 2])
+def test_exported_onnx_gives_the_same_features(tmp_path, normalisation, subpixel_radius):
+    pytest.importorskip("onnx")
+    runtime = pytest.importorskip("onnxruntime")
+    weights = random_weights(dataclasses.replace(TINY, normalisation=normalisation))
+    save_weights(tmp_path / "tiny.safetensors", weights.tensors, weights.card)
+    options = ["--max-keypoints", "400", "--subpixel-radius", str(subpixel_radius), "--threshold", "0.01"]
+    assert main(["export", "onnx", str(tmp_path / "tiny.safetensors"), "-o", str(tmp_path / "m.onnx"), *options]) == 0
+    settings = NetworkSettings(max_keypoints=400, subpixel_radius=subpixel_radius, threshold=0.01)
+    frontend = NetworkFrontend(weights, settings)
+    session = runtime.InferenceSession(tmp_path / "m.onnx", providers=["CPUExecutionProvider"])
+    names = [output.name for output in session.get_outputs()]
+    for size in ((101, 133), (64, 80)):
+        images = [picture(*size, seed=seed) for seed in (3, 4)]
+        batch = (np.stack(images)[:, None] / 255).astype(np.float32)
+        found = dict(zip(names, session.run(None, {"image": batch}), strict=True))
+        for row, image in enumerate(images):
+            expected = frontend(image)
+            count = len(expected)
+            assert 20 < count < 400
+            assert found["valid"][row].sum() == count
+            assert found["valid"][row, :count].all()
+            order = np.lexsort(expected.keypoints.T)
+            theirs = np.lexsort(found["keypoints"][row, :count].T)
+            np.testing.assert_allclose(
+                found["keypoints"][row, theirs], expected.keypoints[order], atol=1e-3 if subpixel_radius else 0
+            )
+            for name in ("scores", "descriptors", "stability"):
+                np.testing.assert_allclose(found[name][row, theirs], getattr(expected, name)[order], atol=1e-4)
+
+
+def test_exported_onnx_finds_lit_pixels(tmp_path):
+    pytest.importorskip("onnx")
+    runtime = pytest.importorskip("onnxruntime")
+    from sivo.frontend.onnx_export import export_onnx
+
+    export_onnx(lit_pixel_weights(), tmp_path / "m.onnx", NetworkSettings(max_keypoints=5))
+    session = runtime.InferenceSession(tmp_path / "m.onnx", providers=["CPUExecutionProvider"])
+    image = np.zeros((1, 1, 37, 51), np.float32)
+    image[0, 0, [7, 30], [13, 41]] = 1
+    image[0, 0, 36, 50] = 1  # in the border
+    keypoints, valid = session.run(["keypoints", "valid"], {"image": image})
+    assert sorted(map(tuple, keypoints[valid].tolist())) == [(13, 7), (41, 30)]
