@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from sivo.backend.compiled import compiled
 from sivo.backend.problem import BundleProblem
 from sivo.backend.settings import ObjectiveSettings
 from sivo.types import Float64, Int64
@@ -43,6 +43,7 @@ class Observations(NamedTuple):
     first_constant: Int64  # (M,) and those from here on are by constant cameras
     first_of_camera: Int64  # (O,) the first observation of this point by this camera: itself, unless it saw it twice
     run_end: Int64  # (O,) end of the consecutive cameras, within a chunk, that start here
+    point_order: Int64  # (M,) the points by the first free camera that saw them: neighbours share cached rows
     point_is_free: NDArray[np.bool_]  # (M,)
     camera_of_free: Int64  # (F,) row of the poses of each free camera
 
@@ -78,19 +79,21 @@ def arrange(problem: BundleProblem, objective: ObjectiveSettings) -> tuple[Const
     free_number[camera_of_free] = np.arange(free)
     camera_index = np.ascontiguousarray(problem.camera_index, np.int64)
     point_index = np.ascontiguousarray(problem.point_index, np.int64)
-    order, first, first_constant, first_of_camera, run_end = _sort(
-        free_number[camera_index], point_index, free, len(problem.points)
-    )
+    order, first, first_constant = _sort(free_number[camera_index], point_index, free, len(problem.points))
+    free_camera = free_number[camera_index[order]]
+    first_of_camera, run_end = _find_runs(free_camera, first, first_constant)
+    first_camera = np.append(free_camera, free)[np.where(first_constant > first[:-1], first[:-1], len(order))]
     observations = Observations(
         order,
         camera_index[order],
-        free_number[camera_index[order]],
+        free_camera,
         np.ascontiguousarray(problem.keypoints[order], np.float64),
         np.ascontiguousarray(problem.weights[order], np.float64),
         first,
         first_constant,
         first_of_camera,
         run_end,
+        np.argsort(first_camera, kind="stable"),
         problem.free_points,
         camera_of_free,
     )
@@ -114,9 +117,9 @@ def _allocate(observations: int, points: int, free: int) -> System:
     )
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _sort(free_camera, point, free, points):  # type: ignore[no-untyped-def]
-    """Counting sort by camera, then a stable one by point; the fields of `Observations` that follow from it."""
+    """Counting sort by camera, then a stable one by point: `order`, `first` and `first_constant` of `Observations`."""
     observations = len(point)
     by_camera = np.empty(observations, np.int64)
     slot = np.zeros(free + 2, np.int64)
@@ -143,14 +146,18 @@ def _sort(free_camera, point, free, points):  # type: ignore[no-untyped-def]
         slot[j] += 1
         if free_camera[row] < free:
             first_constant[j] += 1
+    return order, first, first_constant
 
-    first_of_camera, run_end = np.arange(observations), np.arange(1, observations + 1)
-    for j in range(points):
+
+@compiled
+def _find_runs(free_camera, first, first_constant):  # type: ignore[no-untyped-def]
+    """`first_of_camera` and `run_end` of `Observations`."""
+    first_of_camera, run_end = np.arange(len(free_camera)), np.arange(1, len(free_camera) + 1)
+    for j in range(len(first_constant)):
         for k in range(first[j] + 1, first_constant[j]):
-            if free_camera[order[k]] == free_camera[order[k - 1]]:
+            if free_camera[k] == free_camera[k - 1]:
                 first_of_camera[k] = first_of_camera[k - 1]
         for k in range(first_constant[j] - 2, first[j] - 1, -1):
-            camera = free_camera[order[k + 1]]
-            if camera == free_camera[order[k]] + 1 and camera % CHUNK != 0:
+            if free_camera[k + 1] == free_camera[k] + 1 and free_camera[k + 1] % CHUNK != 0:
                 run_end[k] = run_end[k + 1]
-    return order, first, first_constant, first_of_camera, run_end
+    return first_of_camera, run_end

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sivo.backend.problem import BundleProblem
+from sivo.backend.simulated import simulated_window
 
 
 def kernels_are_cached() -> bool:
@@ -33,32 +33,11 @@ def compile_kernels(progress: Callable[[str], None] | None = None) -> None:
     from sivo.backend.solver import solve
     from sivo.backend.triangulation import triangulate_tracks
 
-    problem = tiny_problem()
+    problem = simulated_window(cameras=4, points=6).problem
     solve(problem)
     order = np.argsort(problem.point_index, kind="stable")
     counts = np.bincount(problem.point_index, minlength=len(problem.points))
     offsets = np.concatenate([[0], np.cumsum(counts)])
     triangulate_tracks(
         problem.keypoints[order], problem.camera_index[order], offsets, problem.cam_from_world, problem.K
-    )
-
-
-def tiny_problem() -> BundleProblem:
-    """Three cameras on a line before nine points, one of the cameras constant; the points start too near."""
-    K = np.array([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
-    cam_from_world = np.tile(np.eye(4), (3, 1, 1))
-    cam_from_world[:, 0, 3] = (0.0, -0.1, -0.2)
-    points = np.array([[0.1 * (j % 3), 0.1 * (j // 3), 1.0 + 0.05 * j] for j in range(9)])
-    camera_index, point_index = np.repeat(np.arange(3), 9), np.tile(np.arange(9), 3)
-    in_camera = points[point_index] + cam_from_world[camera_index, :3, 3]
-    keypoints = 100.0 * in_camera[:, :2] / in_camera[:, 2:] + 50.0
-    return BundleProblem(
-        cam_from_world,
-        0.9 * points,
-        camera_index,
-        point_index,
-        keypoints,
-        np.ones(27),
-        K,
-        np.array([True, False, False]),
     )

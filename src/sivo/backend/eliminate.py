@@ -11,18 +11,17 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from sivo.backend.arrange import CHUNK, COLUMN, POSE, STRIDE
+from sivo.backend.compiled import compiled
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def eliminate(observations, system, damping, min_diagonal):
     """Fill the reduced system and its right side (in `camera_step`); False where a block is not positive definite."""
     system.reduced[:] = 0.0
     for camera in range(len(observations.camera_of_free)):
         _start_block(system, camera, damping, min_diagonal)
-    for j in range(len(observations.point_is_free)):
+    for j in observations.point_order:
         if not observations.point_is_free[j]:
             continue
         if not _invert_root(system, j, damping, min_diagonal):
@@ -39,7 +38,7 @@ def eliminate(observations, system, damping, min_diagonal):
     return True
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _subtract_products(observations, system, a, start, end):
     """S -= Y_a Y_b^T for the observations b of one run, whose columns lie side by side in S as in `elimination`."""
     row = block_start(len(observations.camera_of_free), observations.free_camera[a], observations.free_camera[start])
@@ -52,14 +51,14 @@ def _subtract_products(observations, system, a, start, end):
     )
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def block_start(cameras, camera_a, camera_b):
     """Where the first row of the block of two cameras starts in the flat reduced system."""
     chunks = (cameras + CHUNK - 1) // CHUNK
     return (camera_a * chunks + camera_b // CHUNK) * (POSE * STRIDE) + camera_b % CHUNK * COLUMN
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def subtract_rank_3(rows, left, right0, right1, right2):
     """Take left^T right from six rows at once: the innermost loop, where half of the solver's time goes."""
     a0, a1, a2, a3, a4, a5 = left[0, 0], left[0, 1], left[0, 2], left[0, 3], left[0, 4], left[0, 5]
@@ -75,7 +74,7 @@ def subtract_rank_3(rows, left, right0, right1, right2):
         rows[k + 5 * STRIDE] -= a5 * p + b5 * q + c5 * r
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _start_block(system, camera, damping, min_diagonal):
     """The camera's own block, damped, and minus its gradient."""
     hessian = system.camera_hessian[camera]
@@ -87,7 +86,7 @@ def _start_block(system, camera, damping, min_diagonal):
         system.camera_step[camera, i] = -system.camera_gradient[camera, i]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _invert_root(system, j, damping, min_diagonal):
     """L^-1 of the damped 3x3 block of point j, and L^-1 g."""
     hessian, root = system.point_hessian[j], system.point_root[j]
@@ -116,7 +115,7 @@ def _invert_root(system, j, damping, min_diagonal):
     return True
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _couple(observations, system, j, o):
     """Y = (I; [x]) A R L^-T of one observation, by columns, and its part of the right side."""
     x, y, z = system.in_camera[o, 0], system.in_camera[o, 1], system.in_camera[o, 2]
@@ -144,7 +143,7 @@ def _couple(observations, system, j, o):
         step[5] += m5 * rhs[k]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def back_substitute(observations, system):
     """The step of every free point from the step of the cameras."""
     for j in range(len(observations.point_is_free)):

@@ -15,14 +15,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from sivo.backend.compiled import compiled, inlined
 from sivo.backend.objective import MIN_DEPTH
 
 _MIN_DEPTH = float(MIN_DEPTH)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def point_in_camera(pose, point):
     """R X + t as three numbers."""
     return (
@@ -32,7 +32,7 @@ def point_in_camera(pose, point):
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def inverse_depth(z):
     """1 / Z, kept finite near the plane of the camera as in the reference objective."""
     if abs(z) >= _MIN_DEPTH:
@@ -40,7 +40,7 @@ def inverse_depth(z):
     return -1.0 / _MIN_DEPTH if z < 0.0 else 1.0 / _MIN_DEPTH
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def depth_excess(constants, z):
     """How far the depth is outside of its range: one of the two depth residuals, the other is zero."""
     if z > constants.depth_max:
@@ -50,7 +50,7 @@ def depth_excess(constants, z):
     return 0.0
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def huber(squared_norm, width):
     """rho(s) and its slope rho'(s)."""
     if squared_norm <= width * width:
@@ -59,7 +59,7 @@ def huber(squared_norm, width):
     return 2.0 * width * norm - width * width, width / norm
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def evaluate(constants, observations, poses, points):
     """The objective Omega."""
     total = 0.0
@@ -75,7 +75,7 @@ def evaluate(constants, observations, poses, points):
     return total
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def errors_and_depths(constants, observations, poses, points):
     """Reprojection errors in pixels and depths, in the caller's order of the observations."""
     errors = np.empty(len(observations.order))
@@ -91,7 +91,7 @@ def errors_and_depths(constants, observations, poses, points):
     return errors, depths
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def linearise(constants, observations, system, poses, points):
     """Gradient and Gauss-Newton Hessian of half the objective, with the coupling blocks left factored as A R."""
     free = len(observations.camera_of_free)

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from sivo.backend.arrange import CHUNK, COLUMN, POSE, STRIDE
+from sivo.backend.compiled import compiled
 from sivo.backend.eliminate import block_start, subtract_rank_3
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def solve_reduced(system):
     """Overwrite `camera_step` (the right side) with the solution of S step = right side; False where S is singular.
 
@@ -34,7 +33,7 @@ def solve_reduced(system):
     return True
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _factorise_rows(S, cameras, camera):
     """The six rows of C of one camera, from their diagonal block to the right edge."""
     corner = block_start(cameras, camera, camera)
@@ -62,7 +61,7 @@ def _factorise_rows(S, cameras, camera):
     return True
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _update_rows(S, cameras, camera, later):
     """Take the finished rows of a camera from those of a later one."""
     left = _rows(S, block_start(cameras, camera, later), POSE)
@@ -84,7 +83,7 @@ def _update_rows(S, cameras, camera, later):
         start = end
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _substitute_forwards(S, cameras, camera, step):
     """y of one camera, and its part taken from the right side of the later ones."""
     corner = _rows(S, block_start(cameras, camera, camera), POSE)
@@ -99,7 +98,7 @@ def _substitute_forwards(S, cameras, camera, step):
                 step[later, k] -= block[i, k] * step[camera, i]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _substitute_backwards(S, cameras, camera, step):
     """The step of one camera, from those of the later ones."""
     for later in range(camera + 1, cameras):
@@ -114,7 +113,7 @@ def _substitute_backwards(S, cameras, camera, step):
         step[camera, i] /= corner[i, i]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _rows(S, start, count):
     """The block that starts there, as `count` rows of six."""
     column = start % STRIDE
@@ -122,13 +121,13 @@ def _rows(S, start, count):
     return S.reshape(len(S) // STRIDE, STRIDE)[first : first + count, column : column + POSE]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _chunk_end(start, cameras):
     """The first camera after `start` whose columns lie in another piece of the rows."""
     return min((start // CHUNK + 1) * CHUNK, cameras)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _subtract_scaled(target, scale, source):
     for k in range(len(target)):
         target[k] -= scale * source[k]

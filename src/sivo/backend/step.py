@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from sivo.backend.compiled import compiled
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def apply_step(observations, system, poses, points, new_poses, new_points):
     """new = exp(w) pose + v for the free cameras, point + dX for the points; the rest is copied."""
     new_poses[:] = poses
@@ -20,7 +20,7 @@ def apply_step(observations, system, poses, points, new_poses, new_points):
             new_points[j, i] = points[j, i] + system.point_step[j, i]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _perturb(pose, step, new_pose):
     """Rotate R and t by the unit quaternion of w, re-normalise R by Gram-Schmidt, add v."""
     wx, wy, wz = step[3], step[4], step[5]
@@ -40,7 +40,7 @@ def _perturb(pose, step, new_pose):
     _orthonormalise(new_pose)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _orthonormalise(pose):
     """Rows of R back to unit length and right angles, so that rounding never adds up over many steps."""
     a, b, c = pose[0, :3], pose[1, :3], pose[2, :3]
@@ -58,7 +58,7 @@ def _orthonormalise(pose):
     c[2] = a[0] * b[1] - a[1] * b[0]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def predicted_decrease(system, damping, min_diagonal):
     """Half of (damping * step^T D step - gradient^T step): the decrease of half the objective, were it quadratic."""
     total = 0.0

@@ -6,8 +6,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from sivo.backend.compiled import compiled
 from sivo.backend.linearise import inverse_depth, point_in_camera
 
 _SPREAD = 5  # views, evenly spaced over the track, whose pairs are two-view starts
@@ -15,7 +15,7 @@ _PARALLAX_VIEWS = 48  # of a longer track, this many evenly spaced views decide 
 _FAR = 50.0  # baselines: depth of the start for a point that no ray pair sees in front
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def triangulate_all(keypoints, camera_index, offsets, cam_from_world, intrinsics, redescending, width, max_iterations):
     """Points (T, 3), errors (O,), parallax in degrees (T,), in front of all cameras (T,)."""
     tracks = len(offsets) - 1
@@ -60,7 +60,7 @@ def triangulate_all(keypoints, camera_index, offsets, cam_from_world, intrinsics
     return points, errors, parallax_deg, in_front
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _camera_centres(cam_from_world):
     centres = np.empty((len(cam_from_world), 3))
     for i in range(len(cam_from_world)):
@@ -70,7 +70,7 @@ def _camera_centres(cam_from_world):
     return centres
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _world_rays(keypoints, camera_index, views, cam_from_world, intrinsics, rays):
     """Unit directions, in the world, in which the cameras saw the track."""
     fx, fy, cx, cy = intrinsics
@@ -82,14 +82,14 @@ def _world_rays(keypoints, camera_index, views, cam_from_world, intrinsics, rays
             rays[n, k] = (pose[0, k] * x + pose[1, k] * y + pose[2, k]) * scale
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _residual(keypoint, x, y, z, intrinsics):
     fx, fy, cx, cy = intrinsics
     scale = inverse_depth(z)
     return fx * (x * scale) + cx - keypoint[0], fy * (y * scale) + cy - keypoint[1]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _loss(squared_error, redescending, width):
     """The robust loss and its slope: Geman-McClure s / (1 + s / width^2), or Huber."""
     if redescending:
@@ -101,7 +101,7 @@ def _loss(squared_error, redescending, width):
     return 2.0 * width * error - width * width, width / error
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _cost(keypoints, camera_index, views, cam_from_world, intrinsics, redescending, width, point):
     """The robust cost of a point; infinite where most views have it behind them."""
     total = 0.0
@@ -114,7 +114,7 @@ def _cost(keypoints, camera_index, views, cam_from_world, intrinsics, redescendi
     return math.inf if 2 * behind >= len(views) or not total < math.inf else total
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _start(keypoints, camera_index, views, rays, centres, cam_from_world, intrinsics, redescending, width,
            point, candidate):  # fmt: skip
     """The best of: nearest to all rays, nearest to two of them, far along the middle ray."""
@@ -144,7 +144,7 @@ def _start(keypoints, camera_index, views, rays, centres, cam_from_world, intrin
             point[:] = candidate
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _nearest_to_rays(camera_index, views, rays, centres, start, stop, step, point):
     """Least squares of the distances to the rays start, start + step, ..., stop; False for parallel rays."""
     a00 = a01 = a02 = a11 = a12 = a22 = 0.0
@@ -165,7 +165,7 @@ def _nearest_to_rays(camera_index, views, rays, centres, start, stop, step, poin
     return _solve_symmetric(a00, a01, a02, a11, a12, a22, b0, b1, b2, point)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _solve_symmetric(a00, a01, a02, a11, a12, a22, b0, b1, b2, solution):
     """Solve a 3x3 symmetric positive definite system by cofactors; False where it is singular."""
     c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
@@ -180,7 +180,7 @@ def _solve_symmetric(a00, a01, a02, a11, a12, a22, b0, b1, b2, solution):
     return True
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _refine(keypoints, camera_index, views, cam_from_world, intrinsics, redescending, width, max_iterations,
             point, candidate):  # fmt: skip
     """Damped, re-weighted Gauss-Newton on the reprojection errors; never leaves a worse point."""
@@ -233,7 +233,7 @@ def _refine(keypoints, camera_index, views, cam_from_world, intrinsics, redescen
             break
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _parallax_deg(camera_index, views, centres, point):
     """The largest angle under which the point sees two of its cameras."""
     count = min(len(views), _PARALLAX_VIEWS)

@@ -1,0 +1,160 @@
+"""Many-view triangulation with the poses held."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from sivo.backend import TriangulationSettings, triangulate_tracks
+from sivo.backend.simulated import simulated_window
+from sivo.errors import ConfigError
+
+LOSSES = ("huber", "geman_mcclure")
+
+
+def tracks_of(window):
+    """Observations of a simulated window as tracks under the true poses: what `triangulate_tracks` takes."""
+    problem = window.problem
+    counts = np.bincount(problem.point_index, minlength=len(problem.points))
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    assert (np.diff(problem.point_index) >= 0).all()
+    return [problem.keypoints.copy(), problem.camera_index.copy(), offsets, window.cam_from_world.copy(), problem.K]
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_exact_without_noise(loss):
+    window = simulated_window(cameras=20, points=50, noise=0.0)
+    result = triangulate_tracks(*tracks_of(window), TriangulationSettings(loss=loss))
+    np.testing.assert_allclose(result.points, window.points, atol=1e-5)
+    assert result.errors.max() < 1e-6
+    assert result.in_front.all()
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_within_the_noise(loss):
+    window = simulated_window(cameras=40, points=200, noise=0.5, mean_track=20)
+    result = triangulate_tracks(*tracks_of(window), TriangulationSettings(loss=loss))
+    wide = result.parallax_deg > 5
+    assert wide.sum() > 20
+    assert np.linalg.norm(result.points - window.points, axis=1)[wide].max() < 0.15
+    assert 0.45 < np.median(result.errors) < 0.7  # Rayleigh: 0.59
+
+
+def test_parallax_is_the_angle_at_the_point():
+    cam_from_world = np.tile(np.eye(4), (3, 1, 1))
+    cam_from_world[:, 0, 3] = (0.5, 0.0, -0.5)  # centres at x = -0.5, 0, 0.5; the point is one unit ahead
+    K = np.array([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
+    keypoints = np.array([[100.0, 50.0], [50.0, 50.0], [0.0, 50.0]])
+    arguments = (keypoints, np.arange(3), np.array([0, 3]), cam_from_world, K)
+    result = triangulate_tracks(*arguments, TriangulationSettings(min_parallax_deg=53.0))
+    np.testing.assert_allclose(result.points, [[0.0, 0.0, 1.0]], atol=1e-9)
+    np.testing.assert_allclose(result.parallax_deg, 2 * np.degrees(np.arctan(0.5)))
+    assert result.ok.all()
+    assert not triangulate_tracks(*arguments, TriangulationSettings(min_parallax_deg=54.0)).ok.any()
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_one_wrong_view_does_not_pull_the_point(loss):
+    window = simulated_window(cameras=30, points=80, noise=0.2, mean_track=25)
+    arguments = tracks_of(window)
+    clean = triangulate_tracks(*arguments, TriangulationSettings(loss=loss))
+    long_enough = np.flatnonzero(np.diff(arguments[2]) >= 8)
+    assert len(long_enough) > 20
+    wrong = arguments[2][long_enough] + 3
+    arguments[0][wrong, 1] += 60.0
+    result = triangulate_tracks(*arguments, TriangulationSettings(loss=loss))
+    assert result.errors[wrong].min() > 50
+    moved = np.linalg.norm(result.points - clean.points, axis=1)[long_enough]
+    limit = 0.1 if loss == "huber" else 0.02
+    assert np.median(moved) < limit * np.median(window.points[:, 2])
+
+
+def test_redescending_loss_shows_a_wrong_link_in_full():
+    """A track that jumps to another point: Huber settles between the two, Geman-McClure stays with the longer part."""
+    window = simulated_window(cameras=20, points=40, noise=0.2, mean_track=100)
+    arguments = tracks_of(window)
+    offsets = arguments[2]
+    full = np.flatnonzero(np.diff(offsets) == 20)
+    assert len(full) > 3
+    for track in full:
+        arguments[0][offsets[track] + 12 : offsets[track + 1], 1] += 7.0
+    result = triangulate_tracks(*arguments, TriangulationSettings(loss="geman_mcclure"))
+    for track in full:
+        errors = result.errors[offsets[track] : offsets[track + 1]]
+        assert errors[:12].max() < 2.0
+        assert errors[12:].min() > 5.0
+
+
+def test_cameras_without_a_pose_are_left_out():
+    window = simulated_window(cameras=20, points=50, noise=0.0, mean_track=15)
+    arguments = tracks_of(window)
+    arguments[3][5] = np.nan
+    result = triangulate_tracks(*arguments)
+    lost = arguments[1] == 5
+    assert np.isnan(result.errors[lost]).all()
+    assert lost.sum() > 0
+    found = np.isfinite(result.points).all(axis=1)
+    np.testing.assert_allclose(result.points[found], window.points[found], atol=1e-5)
+    arguments[3][:] = np.nan
+    result = triangulate_tracks(*arguments)
+    assert np.isnan(result.points).all()
+    assert not result.ok.any()
+
+
+def test_short_empty_and_degenerate_tracks():
+    window = simulated_window(cameras=20, points=5, noise=0.0)
+    keypoints, cameras, _, poses, K = tracks_of(window)
+    # empty, one view, the same view twice (no parallax), two views
+    rows = np.array([0, 1, 1, 0, 2])
+    result = triangulate_tracks(keypoints[rows], cameras[rows], np.array([0, 0, 1, 3, 5]), poses, K)
+    assert np.isnan(result.points[:2]).all()
+    assert np.isfinite(result.points[2:]).all()
+    assert result.parallax_deg[2] < 1e-3
+    assert not result.ok[:3].any()
+    nothing = triangulate_tracks(np.zeros((0, 2)), np.zeros(0, np.int64), np.array([0]), poses, K)
+    assert nothing.points.shape == (0, 3)
+
+
+def test_diverging_rays_are_not_ok():
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = -0.2
+    K = np.array([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
+    result = triangulate_tracks(np.array([[40.0, 50.0], [60.0, 50.0]]), np.arange(2), np.array([0, 2]), poses, K)
+    assert np.isfinite(result.points).all()
+    assert not result.ok.any()
+
+
+def test_same_bits_each_time():
+    arguments = tracks_of(simulated_window(cameras=30, points=100, outliers=0.1))
+    first, second = triangulate_tracks(*arguments), triangulate_tracks(*arguments)
+    assert first.points.tobytes() == second.points.tobytes()
+    assert first.errors.tobytes() == second.errors.tobytes()
+
+
+@pytest.mark.parametrize("offsets", [[0, 2], [1, 3], [0, 3, 2, 3], []])
+def test_offsets_that_do_not_fit_are_refused(offsets):
+    with pytest.raises(ValueError, match="track_offsets"):
+        triangulate_tracks(np.zeros((3, 2)), np.zeros(3, np.int64), np.array(offsets), np.eye(4)[None], np.eye(3))
+
+
+def test_impossible_settings_are_refused():
+    with pytest.raises(ConfigError, match="loss"):
+        TriangulationSettings(loss="cauchy")
+
+
+def test_settings_and_problems_import_without_numba():
+    code = "import sys, sivo.backend; sivo.backend.ObjectiveSettings(); sys.exit('numba' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_kernels_compile_ahead_of_time():
+    from sivo.backend.compile import compile_kernels, kernels_are_cached
+
+    compile_kernels()
+    said: list[str] = []
+    assert kernels_are_cached()
+    compile_kernels(said.append)
+    assert said == []
