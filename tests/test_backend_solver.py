@@ -115,7 +115,7 @@ def test_window_with_noise_and_outliers_is_close_to_the_truth():
     turns = se3.rotation_angle_deg(
         result.cam_from_world[:, :3, :3] @ window.cam_from_world[:, :3, :3].transpose(0, 2, 1)
     )
-    assert turns.max() < 0.1
+    assert turns.max() < 0.2
 
 
 def test_default_stopping_costs_next_to_nothing():
