@@ -1,0 +1,116 @@
+"""Videos: streaming, random access equal to iteration, time stamps, damage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sequence_builders import CAMERA, images, write_video
+from sivo.errors import InputError
+from sivo.sequences import open_sequence
+from sivo.sequences.calibration import calibration_yaml
+
+COUNT = 60
+
+
+@pytest.mark.parametrize(("name", "codec"), [("v.mkv", "FFV1"), ("v.avi", "HFYU"), ("v.mp4", "FFV1")])
+def test_lossless_video_round_trip(tmp_path: Path, name: str, codec: str) -> None:
+    write_video(tmp_path / name, images(COUNT), fps=25.0, codec=codec)
+    sequence = open_sequence(tmp_path / name, fov=60.0)
+    assert (sequence.format, sequence.name, len(sequence)) == ("video", "v", COUNT)
+    np.testing.assert_allclose(sequence.times, np.arange(COUNT) / 25, atol=1e-3)
+    for i, (frame, image) in enumerate(zip(sequence, images(COUNT), strict=True)):
+        assert (frame.image == image).all()
+        assert frame.source.endswith(f"{name}#{i}")
+
+
+@pytest.mark.parametrize(
+    ("name", "codec"), [("v.mp4", "mp4v"), ("v.webm", "VP90"), ("v.avi", "MJPG"), ("v.mpg", "MPG1"), ("v.avi", "XVID")]
+)
+def test_random_access_gives_the_frames_of_iteration(tmp_path: Path, name: str, codec: str) -> None:
+    write_video(tmp_path / name, images(COUNT), codec=codec)
+    in_order = list(open_sequence(tmp_path / name, fov=60.0))
+    assert len(in_order) == COUNT
+    sequence = open_sequence(tmp_path / name, fov=60.0)
+    for i in np.random.default_rng(1).permutation(COUNT)[:25].tolist():
+        assert (sequence[i].image == in_order[i].image).all(), i
+        assert sequence[i].time == in_order[i].time
+    strided = open_sequence(tmp_path / name, fov=60.0, start=3, stride=17)
+    assert [frame.index for frame in strided] == [3, 20, 37, 54]
+    assert all((frame.image == in_order[frame.index].image).all() for frame in strided)
+    assert [frame.time for frame in strided] == [in_order[i].time for i in (3, 20, 37, 54)]
+
+
+def test_iteration_decodes_each_frame_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_video(tmp_path / "v.mp4", images(COUNT), codec="mp4v")
+    sequence = open_sequence(tmp_path / "v.mp4", fov=60.0)
+    grabs = []
+    grab = type(sequence.recording)._grab  # type: ignore[attr-defined]
+    monkeypatch.setattr(type(sequence.recording), "_grab", lambda self: grabs.append(1) or grab(self))
+    assert len(list(sequence)) == COUNT
+    assert len(grabs) <= COUNT
+
+
+def test_frame_rate_and_calibration_beside_the_video(tmp_path: Path) -> None:
+    write_video(tmp_path / "walk.avi", images(5), fps=25.0)
+    (tmp_path / "walk.yaml").write_text(calibration_yaml(CAMERA))
+    assert open_sequence(tmp_path / "walk.avi").camera == CAMERA
+    np.testing.assert_allclose(open_sequence(tmp_path / "walk.avi", fps=10.0).times, np.arange(5) / 10)
+
+
+def test_video_cut_short_gives_the_frames_it_has(tmp_path: Path) -> None:
+    write_video(tmp_path / "whole.avi", images(COUNT))
+    whole = list(open_sequence(tmp_path / "whole.avi", fov=60.0))
+    data = (tmp_path / "whole.avi").read_bytes()
+    (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
+    sequence = open_sequence(tmp_path / "cut.avi", fov=60.0)
+    frames = list(sequence)
+    assert COUNT // 3 < len(frames) < 2 * COUNT // 3
+    assert len(frames) + len(sequence.skipped) == len(sequence)
+    undamaged = [(frame.image == whole[frame.index].image).all() for frame in frames]
+    assert sum(undamaged) >= len(frames) - 1
+
+
+def test_mp4_without_its_index_is_a_one_line_error(tmp_path: Path) -> None:
+    write_video(tmp_path / "v.mp4", images(COUNT), codec="mp4v")
+    data = (tmp_path / "v.mp4").read_bytes()
+    (tmp_path / "cut.mp4").write_bytes(data[: len(data) // 2])
+    with pytest.raises(InputError, match=r"cut.mp4: cannot be opened as a video"):
+        open_sequence(tmp_path / "cut.mp4", fov=60.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "codec"), [("v.avi", "MJPG"), ("v.mkv", "FFV1"), ("v.webm", "VP90"), ("v.mp4", "mp4v")]
+)
+def test_damaged_bytes_never_do_worse_than_errors_and_skips(tmp_path: Path, name: str, codec: str) -> None:
+    write_video(tmp_path / name, images(20), codec=codec)
+    data = bytearray((tmp_path / name).read_bytes())
+    random = np.random.default_rng(3)
+    outcomes = []
+    for trial in range(12):
+        damaged = bytearray(data)
+        if trial % 2:
+            del damaged[int(random.integers(1, len(data))) :]
+        else:
+            for position in random.integers(0, len(data), 20):
+                damaged[position] = int(random.integers(0, 256))
+        file = tmp_path / f"{trial}{Path(name).suffix}"
+        file.write_bytes(damaged)
+        try:
+            sequence = open_sequence(file, fov=60.0)
+            frames = list(sequence)
+            assert len(frames) + len(sequence.skipped) == len(sequence)
+            outcomes.append("frames")
+        except InputError as error:
+            outcomes.append("error" if "\n" not in str(error) else "long error")
+    assert "frames" in outcomes
+    assert "long error" not in outcomes
+
+
+def test_something_else_named_video(tmp_path: Path) -> None:
+    for content in (b"", b"hello", bytes(5000)):
+        (tmp_path / "v.mp4").write_bytes(content)
+        with pytest.raises(InputError, match=r"v\.mp4"):
+            open_sequence(tmp_path / "v.mp4", fov=60.0)
