@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from sivo.types import Float64
 
 
-def accuracy(errors: Float64, threshold: float) -> float:
-    """Share of `errors` (N,) strictly below the threshold, as in the paper's "< 5"; a failure is an error of inf."""
-    return float(np.mean(errors < threshold))
+def below(errors: Float64, threshold: float) -> NDArray[np.bool_]:
+    """Which `errors` (N,) are strictly below the threshold, as in the paper's "< 5"; a failure is an error of inf."""
+    return np.asarray(errors < threshold)
 
 
 def accuracy_curve(errors: Float64, thresholds: Float64) -> Float64:
@@ -18,12 +18,12 @@ def accuracy_curve(errors: Float64, thresholds: Float64) -> Float64:
     return np.searchsorted(np.sort(errors), thresholds, side="left") / len(errors)
 
 
-def area_under_curve(errors: Float64, limit: float) -> float:
-    """Area under the accuracy over thresholds from 0 to `limit`, divided by `limit`: 1 where no error is left.
+def area_shares(errors: Float64, limit: float) -> Float64:
+    """What each error adds to the area under the accuracy curve from 0 to `limit`, divided by `limit`.
 
-    Exact: an error e contributes from e to the limit.
+    Their mean is the area, exactly: an error e is counted from e to the limit. 1 where no error is left.
     """
-    return float(np.mean(np.clip(1.0 - errors / limit, 0.0, None)))
+    return np.clip(1.0 - errors / limit, 0.0, None)
 
 
 class Bootstrap:

@@ -80,8 +80,8 @@ class TrajectoryErrors:
 def clean_truth(truth: Trajectory) -> tuple[Trajectory, NDArray[np.bool_]]:
     """The truth with rotations projected to SO(3), and a mask (N,) of the rows that are NaN or not rigid, now NaN."""
     poses = clean_poses(truth.world_from_cam)[0]
-    good: NDArray[np.bool_] = np.isfinite(poses).all(axis=(1, 2))
-    return Trajectory(truth.times, poses, np.where(good, truth.segment, -1)), ~good
+    unusable = np.asarray(~np.isfinite(poses).all(axis=(1, 2)))
+    return Trajectory(truth.times, poses, np.where(unusable, -1, truth.segment)), unusable
 
 
 def associate(first: Float64, second: Float64, max_difference: float) -> Int64:

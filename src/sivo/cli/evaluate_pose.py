@@ -1,0 +1,172 @@
+"""3D-to-2D pose estimation on random frame pairs (the paper's Table 1): match, lift image A by its depth, solve for B.
+
+Sequences need depth and true poses. Every frontend gets the same pairs. With -o the features are kept, so that adding
+a frontend or a gap computes only what is new.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sivo.cli.evaluate_options import add_feature_arguments, add_run_arguments, add_sequence_arguments
+from sivo.errors import InputError, SivoError
+
+if TYPE_CHECKING:
+    from sivo.evaluation.pose import PoseSettings
+    from sivo.evaluation.sources import FeatureSource, Recorded
+
+COMMAND = "evaluate pose"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `sivo evaluate pose`."""
+    parser.add_argument("sequences", nargs="*", metavar="SEQUENCE", help="sequences with depth and true poses")
+    add_feature_arguments(parser)
+    parser.add_argument("--gaps", nargs="+", type=int, default=[30, 60, 90], help="frames between the two images")
+    parser.add_argument("--pairs", type=int, default=50, help="random pairs per sequence and gap")
+    parser.add_argument(
+        "--estimator",
+        nargs="+",
+        choices=("opencv", "poselib"),
+        default=["opencv", "poselib"],
+        help="opencv: default solvePnPRansac, the paper's; poselib: a robust one",
+    )
+    parser.add_argument("--depth-sampling", choices=("bilinear", "nearest"), default="bilinear", help="of image A")
+    parser.add_argument("--per-sequence", action="store_true", help="print the table of each sequence too")
+    parser.add_argument("--from", dest="results", type=Path, metavar="POSE.JSON", help="print an earlier run again")
+    parser.add_argument("--export-images", type=Path, metavar="DIR", help="write the frames of all pairs, and stop")
+    add_run_arguments(parser)
+    add_sequence_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int | None:
+    """Evaluate, or print again; leaves pose.json, pose.md, curves and pairs.parquet in the output folder."""
+    from sivo.evaluation.tables import pose_tables
+
+    if arguments.results is not None:
+        results = read_results(arguments.results)
+        print(pose_tables(results, arguments.per_sequence), end="")
+        _draw(results, arguments.results.parent if arguments.output is None else arguments.output)
+        return 0
+    if not arguments.sequences:
+        raise InputError("sivo evaluate pose: give a SEQUENCE, or --from POSE.JSON")
+    if arguments.export_images is not None:
+        return _export(arguments)
+    results = _evaluate(arguments)
+    print(pose_tables(results, arguments.per_sequence), end="")
+    return 0
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """The content of a `pose.json`.
+
+    Raises:
+        InputError: not such a file.
+    """
+    try:
+        results: dict[str, Any] = json.loads(path.read_text())
+        if results["protocol"] != "pose" or not results["rows"]:
+            raise KeyError
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{path}: is no pose.json of `sivo evaluate pose`; check the path") from None
+    return results
+
+
+def _settings(arguments: argparse.Namespace) -> PoseSettings:
+    from sivo.evaluation.pose import PoseSettings
+
+    return PoseSettings(
+        gaps=tuple(arguments.gaps),
+        pairs=arguments.pairs,
+        max_keypoints=arguments.max_keypoints,
+        estimators=tuple(arguments.estimator),
+        seed=arguments.seed,
+        depth_sampling=arguments.depth_sampling,
+    )
+
+
+def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
+    from sivo import __version__
+    from sivo.cli.evaluate_options import feature_sources, sequence_sources
+    from sivo.evaluation.parallel import Workers
+    from sivo.evaluation.pose_results import results, write_records
+    from sivo.evaluation.pose_run import run_pose_protocol
+    from sivo.files import make_output_folder, write_json
+
+    settings, sources = _settings(arguments), sequence_sources(arguments)
+    output: Path | None = arguments.output
+    if output is not None:
+        make_output_folder(output, COMMAND)
+    frontends, skipped = feature_sources(arguments, one_sequence=len(sources) == 1)
+    request = _request(settings, sources, frontends)
+    if output is not None and (output / "pose.json").is_file():
+        earlier = read_results(output / "pose.json")
+        if earlier.get("request") == json.loads(json.dumps(request)):
+            return earlier
+    with tempfile.TemporaryDirectory(prefix="sivo-") as temporary, Workers(arguments.workers, progress=True) as workers:
+        cache = (output or Path(temporary)) / "features"
+        run = run_pose_protocol(list(sources), frontends, settings, cache, workers)
+    found = {"protocol": "pose", "sivo": __version__, **results(run), "skipped_frontends": skipped, "request": request}
+    if output is not None:
+        write_records(run, output / "pairs.parquet")
+        write_json(output / "pose.json", found)
+        _write_text(found, output)
+        _draw(found, output)
+    return found
+
+
+def _request(settings: PoseSettings, sources: list[Recorded], frontends: list[FeatureSource]) -> dict[str, Any]:
+    """All that decides the result; an earlier result with the same request is printed again."""
+    from sivo.config import to_dict
+    from sivo.evaluation.sources import sequence_fingerprint
+
+    return {
+        "settings": to_dict(settings),
+        "sequences": [sequence_fingerprint(source, source.open()) for source in sources],
+        "frontends": [{"label": frontend.label, **frontend.fingerprint()} for frontend in frontends],
+    }
+
+
+def _write_text(results: dict[str, Any], output: Path) -> None:
+    from sivo.evaluation.tables import pose_tables
+    from sivo.files import write_text
+
+    write_text(output / "pose.md", pose_tables(results, sequences=len(results["sequences"]) > 1))
+
+
+def _draw(results: dict[str, Any], output: Path) -> None:
+    from sivo.evaluation.plots import draw_pose_curves
+
+    for estimator in results["settings"]["estimators"]:
+        draw_pose_curves(results, estimator, output / f"curves-{estimator}.png")
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    """Write the frames that the evaluation will use, as delivered, for a frontend that runs elsewhere."""
+    import cv2
+
+    from sivo.cli.evaluate_options import sequence_sources
+    from sivo.evaluation.pairs import pairs_of_sequence
+    from sivo.files import make_output_folder, written_atomically
+
+    make_output_folder(arguments.export_images, f"{COMMAND} --export-images")
+    written = 0
+    for source in sequence_sources(arguments):
+        sequence = source.open()
+        drawn = pairs_of_sequence(sequence, tuple(arguments.gaps), arguments.pairs, arguments.seed)
+        folder = arguments.export_images / sequence.name
+        folder.mkdir(exist_ok=True)
+        for row in sorted({int(i) for pairs in drawn.pairs.values() for i in pairs.ravel()}):
+            try:
+                frame = sequence[row]
+            except SivoError:
+                continue  # its pairs are left out of the evaluation, too
+            with written_atomically(folder / f"{frame.index:06d}.png") as temporary:
+                cv2.imwrite(str(temporary), frame.image)
+            written += 1
+    print(f"{written} images in {arguments.export_images}; export features as SEQUENCE/NUMBER.npz beside or elsewhere")
+    return 0

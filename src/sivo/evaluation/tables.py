@@ -1,0 +1,150 @@
+"""Tables in Markdown, laid out like the paper's; the same text serves the terminal and the file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table with aligned columns: the first to the left, the others to the right."""
+    widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
+
+    def line(cells: Sequence[str]) -> str:
+        padded = [c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(cells, widths, strict=True))]
+        return "| " + " | ".join(padded) + " |"
+
+    rule = "|" + "|".join("-" * (w + 2) if i == 0 else "-" * (w + 1) + ":" for i, w in enumerate(widths)) + "|"
+    return "\n".join([line(header), rule, *map(line, rows)])
+
+
+def decimals(value: float | None, places: int = 3) -> str:
+    """`.432` as in the paper's tables; 1.000 keeps its leading digit, and a missing value is a dash."""
+    if value is None:
+        return "–"
+    text = f"{value:.{places}f}"
+    return text[1:] if text.startswith("0.") else text
+
+
+def bold_best(cells: list[str], values: Sequence[float | None], largest: bool = True) -> list[str]:
+    """The cells with the best value in bold, ties too, as they are printed."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return cells
+    winner = max(known) if largest else min(known)
+    printed = {cell for cell, value in zip(cells, values, strict=True) if value == winner}
+    return [f"**{cell}**" if cell in printed else cell for cell in cells]
+
+
+def columns_to_rows(labels: Sequence[str], columns: Sequence[list[str]]) -> list[list[str]]:
+    """Table rows from a label column and cell columns."""
+    return [[label, *(column[i] for column in columns)] for i, label in enumerate(labels)]
+
+
+def pose_tables(results: dict[str, Any], sequences: bool = False) -> str:
+    """`pose.json` as Markdown: Table 1 per solver, the intervals of its cells, and what lies behind them.
+
+    Args:
+        results: content of `pose.json`.
+        sequences: add Table 1 for each sequence.
+    """
+    settings = results["settings"]
+    parts = [_setup(results)]
+    for estimator in settings["estimators"]:
+        parts += [f"### Pose estimation, solver {estimator}", _table_1(results, results["rows"], estimator)]
+        parts += [
+            f"{100 * settings['confidence']:.0f} % bootstrap intervals of the same cells:",
+            _intervals(results, estimator),
+        ]
+    parts += ["### Matching (does not depend on the solver)", _matching(results)]
+    if sequences:
+        for sequence in results["sequences"]:
+            rows = [row for row in results["sequence_rows"] if row["sequence"] == sequence["name"]]
+            for estimator in settings["estimators"]:
+                parts += [f"### {sequence['name']}, solver {estimator}", _table_1(results, rows, estimator)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _setup(results: dict[str, Any]) -> str:
+    settings = results["settings"]
+    lines = []
+    for sequence in results["sequences"]:
+        pairs = ", ".join(f"{count} at gap {gap}" for gap, count in sequence["pairs"].items())
+        line = f"- {sequence['name']}: {sequence['frames']} frames, pairs: {pairs}"
+        for kind, what in (
+            ("invalid_poses", "without a valid true pose"),
+            ("unreadable_frames", "that cannot be decoded"),
+        ):
+            if sequence[kind]:
+                named = ", ".join(map(str, sequence[f"first_{kind}"]))
+                more = ", …" if sequence[kind] > len(sequence[f"first_{kind}"]) else ""
+                line += f"; left out {sequence[kind]} frames {what} ({named}{more})"
+        lines.append(line)
+    for skipped in results.get("skipped_frontends", ()):
+        lines.append(f"- frontend {skipped['frontend']} not run: {skipped['reason']}")
+    return (
+        f"At most {settings['max_keypoints']} keypoints, mutual nearest neighbours, {settings['depth_sampling']} depth, "
+        f"seed {settings['seed']}; success is strictly below {settings['max_rotation_deg']:g}° and "
+        f"{100 * settings['max_translation_m']:g} cm.\n\n" + "\n".join(lines)
+    )
+
+
+def _cell(rows: list[dict[str, Any]], frontend: str, estimator: str, gap: int, field: str) -> Any:
+    for row in rows:
+        if (row["frontend"], row["estimator"], row["gap"]) == (frontend, estimator, gap):
+            return row[field]
+    return None
+
+
+def _table_1(results: dict[str, Any], rows: list[dict[str, Any]], estimator: str) -> str:
+    """The paper's Table 1, for one solver."""
+    settings, frontends = results["settings"], results["frontends"]
+    gaps = settings["gaps"]
+    pose = {entry["gap"]: entry for entry in results["gaps"]}
+    header = ["Frame difference", *map(str, gaps), *map(str, gaps)]
+    average = ["Average relative pose", *(f"{pose[gap]['mean_rotation_deg']:.0f}°" for gap in gaps)]
+    average += [f"{100 * pose[gap]['mean_translation_m']:.0f} cm" for gap in gaps]
+    rotation = f"Rot. < {settings['max_rotation_deg']:g}°"
+    translation = f"Transl. < {100 * settings['max_translation_m']:g} cm"
+    legend = ["", *([rotation] * len(gaps)), *([translation] * len(gaps))]
+    columns = []
+    for field in ("rotation_success", "translation_success"):
+        for gap in gaps:
+            values = [_cell(rows, frontend, estimator, gap, field) for frontend in frontends]
+            columns.append(bold_best([decimals(value) for value in values], values))
+    shown = [average, legend] if rows is results["rows"] else [legend]
+    return markdown(header, [*shown, *columns_to_rows(frontends, columns)])
+
+
+def _intervals(results: dict[str, Any], estimator: str) -> str:
+    gaps, frontends = results["settings"]["gaps"], results["frontends"]
+    header, columns = [""], []
+    for field, name in (("rotation_success", "rot."), ("translation_success", "transl."), ("pose_success", "both")):
+        for gap in gaps:
+            header.append(f"{name} {gap}")
+            spans = [_cell(results["rows"], frontend, estimator, gap, f"{field}_interval") for frontend in frontends]
+            columns.append([f"{decimals(low, 2)}–{decimals(high, 2)}" for low, high in spans])
+    return markdown(header, columns_to_rows(frontends, columns))
+
+
+def _matching(results: dict[str, Any]) -> str:
+    """Repeatability, precision and match counts; inliers of the last solver, which is the robust one by default."""
+    settings, frontends, rows = results["settings"], results["frontends"], results["rows"]
+    solvers = settings["estimators"]
+    header, columns = [""], []
+    for field, name, places in (
+        ("repeatability", "repeatab.", 3),
+        ("precision", "precision", 3),
+        ("judged_matches", "matches", 0),
+        ("right_matches", "right", 0),
+    ):
+        for gap in settings["gaps"]:
+            header.append(f"{name} {gap}")
+            values = [_cell(rows, frontend, solvers[0], gap, field) for frontend in frontends]
+            columns.append(bold_best([decimals(value, places) for value in values], values))
+    for solver in solvers:
+        for gap in settings["gaps"]:
+            header.append(f"inliers {solver} {gap}")
+            values = [_cell(rows, frontend, solver, gap, "inliers") for frontend in frontends]
+            columns.append([decimals(value, 0) for value in values])
+    return markdown(header, columns_to_rows(frontends, columns))
