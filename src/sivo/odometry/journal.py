@@ -126,6 +126,15 @@ class Journal:
         """A view has no pose."""
         self._note(view, "lost", f"only {inliers} points of the map found")
 
+    def contradicted(self, view: View, answer: str) -> None:
+        """Fresh two-view geometry says that the map is wrong."""
+        self._note(view, "contradiction", f"two-view geometry contradicts the map; {answer}")
+
+    def restarted(self) -> None:
+        """The segment that had begun is undone."""
+        self._errors = []
+        self._open = False
+
     def give_up(self, views: Sequence[View]) -> None:
         """These views stay without a pose."""
         for view in views:

@@ -6,11 +6,12 @@ import numpy as np
 
 from sivo.geometry import se3
 from sivo.geometry.camera import Camera
+from sivo.odometry.health import HealthCheck
 from sivo.odometry.journal import Journal
 from sivo.odometry.local_map import LocalMap
 from sivo.odometry.settings import OdometrySettings
 from sivo.odometry.start import Refusal, start_map
-from sivo.odometry.view import View, common_tracks
+from sivo.odometry.view import NO_POINT, View, common_tracks
 from sivo.odometry.window import WindowReport, adjust
 
 
@@ -30,6 +31,8 @@ class RobustMapper:
         self._keyframes: list[View] = []  # older keyframes: free ones at the end, constants before them
         self._last_keyframe: View | None = None
         self._patience = 0  # frames to wait before the next try to start
+        self._health = HealthCheck(camera, settings.health, descriptor_distance, settings.seed)
+        self._young: list[View] = []  # all views of a map that may still be started anew; nothing of it is final
 
     def track(self, view: View) -> None:
         """Pose of the next view, as far as it can be had."""
@@ -63,6 +66,10 @@ class RobustMapper:
         report = self._adjust_window()
         self._map.remember(view)
         self._journal.tracked(view, inliers, share, report)
+        if self._health.contradicts(view, {v.position: v for v in self._map.history}):
+            self._answer_contradiction(view)
+            return
+        self._grow_up(view)
         self._slide()
 
     def _adjust_window(self) -> WindowReport:
@@ -81,6 +88,42 @@ class RobustMapper:
             self._settings.solver,
             window.max_error,
         )
+
+    def _answer_contradiction(self, view: View) -> None:
+        """A young map is started anew over all its frames; an old one ends, and the next takes its last frames."""
+        if self._young:
+            self._journal.contradicted(view, "the map is started anew")
+            self._journal.restarted()
+            self._waiting = [*self._young, view]
+            self._clear()
+        else:
+            self._journal.contradicted(view, "the segment ends")
+            doubtful, self._recent = self._recent, []
+            self._end_segment("contradicted by two-view geometry")
+            self._waiting = doubtful
+        self._forget(self._waiting)
+        self._start_now(view)
+
+    def _clear(self) -> None:
+        """No map."""
+        self._map, self._last_keyframe = None, None
+        self._recent, self._keyframes, self._young = [], [], []
+        self._patience = 0
+
+    @staticmethod
+    def _forget(views: list[View]) -> None:
+        """Views as before they were localised."""
+        for view in views:
+            view.cam_from_world = None
+            view.points[:] = NO_POINT
+            view.keyframe, view.followers = False, []
+
+    def _grow_up(self, view: View) -> None:
+        """A young map keeps all its views; one that nothing contradicted for long enough is trusted."""
+        if self._young:
+            self._young.append(view)
+            if len(self._young) > self._settings.health.young_frames:
+                self._young = []
 
     def _free_keyframes(self) -> list[View]:
         return self._keyframes[-self._settings.window.keyframes :]
@@ -112,6 +155,8 @@ class RobustMapper:
                 assert view.cam_from_world is not None
                 assert keyframe.cam_from_world is not None
                 keyframe.followers.append((view, view.cam_from_world @ se3.inverse(keyframe.cam_from_world)))
+        if self._young:
+            return
         for keyframe in self._keyframes[: -window.keyframes]:
             if not keyframe.final:
                 self._finalise(keyframe)
@@ -154,8 +199,10 @@ class RobustMapper:
         self._patience -= 1
         if len(self._waiting) > self._settings.start.max_waiting:
             self._journal.give_up([self._waiting.pop(0)])
-        if len(self._waiting) < 2 or self._patience > 0:
-            return
+        if len(self._waiting) >= 2 and self._patience <= 0:
+            self._start_now(view)
+
+    def _start_now(self, view: View) -> None:
         started = start_map(self._waiting, self._camera, self._settings, self._descriptor_distance)
         if isinstance(started, Refusal):
             self._journal.refused(view, started.reason)
@@ -165,6 +212,8 @@ class RobustMapper:
         self._map = started
         self._journal.started(self._waiting)
         self._recent, self._waiting = self._waiting, []
+        self._young = list(self._recent)
+        self._health = HealthCheck(self._camera, self._settings.health, self._descriptor_distance, self._settings.seed)
         for waiting_view in self._recent:
             self._choose_keyframe(waiting_view)
         self._slide()
@@ -179,6 +228,4 @@ class RobustMapper:
         for view in self._recent:
             self._journal.finalise(view, self._map)
         self._journal.ended(self._map, reason)
-        self._map, self._last_keyframe = None, None
-        self._recent, self._keyframes = [], []
-        self._patience = 0
+        self._clear()

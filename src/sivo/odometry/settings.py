@@ -56,6 +56,21 @@ class TrackingLossSettings:
 
 
 @dataclass(frozen=True)
+class HealthSettings:
+    """The independent check of the map against two views (see `sivo.odometry.health`)."""
+
+    interval: int = 5  # frames between two checks
+    gaps: tuple[int, ...] = (3, 6, 12)  # frames between the two views of a check
+    epipolar_error: float = 1.5  # pixels
+    min_inliers: int = 30  # of the two views' own essential matrix; fewer say nothing
+    min_inlier_share: float = 0.15  # of their matches
+    rounds: int = 3  # consecutive checks that are judged together
+    min_evidence: int = 100  # inliers in all of them; fewer decide nothing
+    min_agreement: float = 0.85  # right maps stay over 0.90, wrong ones fall under 0.80
+    young_frames: int = 60  # a map contradicted this early is started anew over the same frames
+
+
+@dataclass(frozen=True)
 class OdometrySettings:
     """Settings of `VisualOdometry`."""
 
@@ -65,6 +80,7 @@ class OdometrySettings:
     start: StartSettings = field(default_factory=StartSettings)
     window: WindowSettings = field(default_factory=WindowSettings)
     loss: TrackingLossSettings = field(default_factory=TrackingLossSettings)
+    health: HealthSettings = field(default_factory=HealthSettings)
     objective: ObjectiveSettings = field(default_factory=lambda: ObjectiveSettings(depth_weight=0.0))
     solver: SolverSettings = field(default_factory=lambda: SolverSettings(max_iterations=8, relative_decrease=1e-3))
     paper_objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)  # of the mode `paper`

@@ -80,7 +80,9 @@ def _points_of(
     result = triangulate_tracks(keypoints, np.tile([0, 1], count), offsets, poses, camera.K)
     worst = result.errors.reshape(-1, 2).max(axis=1)
     parallax_deg = result.parallax_deg
-    good = result.in_front & (worst <= 2.0 * settings.epipolar_error) & (parallax_deg > 0.25 * settings.min_parallax_deg)
+    good = (
+        result.in_front & (worst <= 2.0 * settings.epipolar_error) & (parallax_deg > 0.25 * settings.min_parallax_deg)
+    )
     if (parallax_deg[good] >= settings.min_parallax_deg).sum() < settings.min_points:
         return Refusal("too little parallax")
     return TwoView(b_from_a, rows_a[good], rows_b[good], result.points[good], parallax_deg[good])

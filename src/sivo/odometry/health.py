@@ -1,0 +1,108 @@
+"""Does the map still agree with the pictures? An independent two-view check, and what it answers.
+
+A wrong map can fit its own tracks well: it chose them, and lets go of what does not fit. Two views matched afresh
+and their own essential matrix know nothing of the map; where both are sure and disagree, the map is wrong.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+
+from sivo.geometry import se3
+from sivo.geometry.camera import Camera
+from sivo.odometry.local_map import poselib_camera
+from sivo.odometry.settings import HealthSettings
+from sivo.odometry.view import View
+from sivo.tracking.matching import match_units
+from sivo.types import Float64
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Matches of two views that fit the map's relative pose, against those that fit their own essential matrix."""
+
+    map_inliers: int
+    own_inliers: int
+    matches: int
+
+
+class HealthCheck:
+    """Compares the map with two-view geometry every few frames, and says when it contradicts the map.
+
+    Measured on five real sequences with three frontends: over three checks a right map keeps at least 90 % of the
+    inliers, a mirrored or otherwise wrong one at most 80 % (docs/odometry.md).
+    """
+
+    def __init__(self, camera: Camera, settings: HealthSettings, descriptor_distance: float, seed: int) -> None:
+        self._camera = camera
+        self._settings = settings
+        self._descriptor_distance = descriptor_distance
+        self._seed = seed
+        self._rounds: deque[tuple[int, int]] = deque(maxlen=settings.rounds)
+
+    def contradicts(self, view: View, earlier: Mapping[int, View]) -> bool:
+        """Whether the last checks together say that the map is wrong.
+
+        Args:
+            view: the newest view with a pose.
+            earlier: recent views with poses by position.
+        """
+        settings = self._settings
+        if view.position % settings.interval:
+            return False
+        pairs = [earlier[view.position - gap] for gap in settings.gaps if view.position - gap in earlier]
+        found = [
+            agreement(a, view, self._camera, self._descriptor_distance, settings.epipolar_error, self._seed)
+            for a in pairs
+        ]
+        sure = [
+            each
+            for each in found
+            if each.own_inliers >= max(settings.min_inliers, settings.min_inlier_share * each.matches)
+        ]
+        self._rounds.append((sum(each.map_inliers for each in sure), sum(each.own_inliers for each in sure)))
+        map_inliers, own_inliers = (sum(counts) for counts in zip(*self._rounds, strict=True))
+        enough = len(self._rounds) == settings.rounds and own_inliers >= settings.min_evidence
+        return enough and map_inliers < settings.min_agreement * own_inliers
+
+
+def agreement(
+    a: View, b: View, camera: Camera, descriptor_distance: float, epipolar_error: float, seed: int
+) -> Agreement:
+    """Match two views with poses afresh, and count."""
+    assert a.cam_from_world is not None
+    assert b.cam_from_world is not None
+    matches = match_units(a.descriptors, b.descriptors, descriptor_distance)
+    if len(matches) < 8:
+        return Agreement(0, 0, len(matches))
+    pixels_a, pixels_b = a.keypoints[matches[:, 0]], b.keypoints[matches[:, 1]]
+    shape = poselib_camera(camera)
+    _, report = poselib.estimate_relative_pose(
+        pixels_a,
+        pixels_b,
+        shape,
+        shape,
+        {"max_epipolar_error": epipolar_error, "min_iterations": 100, "max_iterations": 1000, "seed": seed},
+    )
+    b_from_a = b.cam_from_world @ se3.inverse(a.cam_from_world)
+    errors = epipolar_errors(b_from_a, camera, pixels_a, pixels_b)
+    fits = int((errors < epipolar_error).sum())
+    return Agreement(fits, int(report["num_inliers"]), len(matches))
+
+
+def epipolar_errors(b_from_a: Float64, camera: Camera, pixels_a: Float64, pixels_b: Float64) -> Float64:
+    """Sampson distance in pixels (N,) of matches to a relative pose."""
+    x, y, z = b_from_a[:3, 3]
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    rays_a, rays_b = camera.unproject(pixels_a), camera.unproject(pixels_b)
+    lines_b = rays_a @ (cross @ b_from_a[:3, :3]).T
+    lines_a = rays_b @ (cross @ b_from_a[:3, :3])
+    algebraic = (rays_b * lines_b).sum(axis=1)
+    slope = (lines_b[:, :2] ** 2).sum(axis=1) + (lines_a[:, :2] ** 2).sum(axis=1)
+    focal = np.sqrt(camera.fx * camera.fy)
+    return focal * np.abs(algebraic) / np.sqrt(np.maximum(slope, 1e-18))
