@@ -16,6 +16,7 @@ from sivo.errors import SivoError
 # a verb with its own sub-commands adds them with `parser.add_subparsers`. Heavy imports belong inside `run`.
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("run", "visual odometry on one sequence: trajectory, map, tracks"),
+    "evaluate": ("evaluate", "how good a frontend or a trajectory is: the paper's protocols"),
     "show": ("show", "pictures of a finished run"),
     "weights": ("weights", "import public weights, prepare weights for int8, print a model card"),
     "export": ("export", "what other tools read: ONNX"),

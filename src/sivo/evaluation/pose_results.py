@@ -28,20 +28,19 @@ def results(run: PoseRun) -> dict[str, Any]:
     rows, sequence_rows, curves = [], [], []
     for gap in settings.gaps:
         in_gap = run.records[run.records["gap"] == gap]
-        resampled = {None: Bootstrap(_pairs_in(in_gap), settings.seed, settings.resamples, settings.confidence)}
+        bootstraps: dict[int | None, Bootstrap] = {None: _bootstrap(in_gap, settings)}
         for sequence in np.unique(in_gap["sequence"]):
-            count = _pairs_in(in_gap[in_gap["sequence"] == sequence])
-            resampled[int(sequence)] = Bootstrap(count, settings.seed, settings.resamples, settings.confidence)
+            bootstraps[int(sequence)] = _bootstrap(in_gap[in_gap["sequence"] == sequence], settings)
         for frontend, label in enumerate(run.frontends):
             for estimator, solver in enumerate(settings.estimators):
                 chosen = in_gap[(in_gap["frontend"] == frontend) & (in_gap["estimator"] == estimator)]
                 head = {"frontend": label, "estimator": solver, "gap": gap}
-                rows.append({**head, **_row(chosen, settings, resampled[None])})
+                rows.append({**head, **_row(chosen, settings, bootstraps[None])})
                 curves.append({**head, **_curves(chosen, settings)})
                 for sequence in np.unique(chosen["sequence"]):
                     part = chosen[chosen["sequence"] == sequence]
                     name = run.sequences[sequence].name
-                    row = _row(part, settings, resampled[int(sequence)])
+                    row = _row(part, settings, bootstraps[int(sequence)])
                     sequence_rows.append({"sequence": name, **head, **row})
     return {
         "settings": to_dict(settings),
@@ -124,9 +123,10 @@ def _sequence(run: PoseRun, number: int) -> dict[str, Any]:
     }
 
 
-def _pairs_in(records: Records) -> int:
-    first = records[(records["frontend"] == 0) & (records["estimator"] == 0)]
-    return len(first)
+def _bootstrap(records: Records, settings: PoseSettings) -> Bootstrap:
+    """Resamples of the pairs in `records`, the same for every frontend and solver."""
+    pairs = int(((records["frontend"] == 0) & (records["estimator"] == 0)).sum())
+    return Bootstrap(pairs, settings.seed, settings.resamples, settings.confidence)
 
 
 def _finite(value: float) -> float | None:

@@ -21,9 +21,18 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def decimals(value: float | None, places: int = 3) -> str:
     """`.432` as in the paper's tables; 1.000 keeps its leading digit, and a missing value is a dash."""
     if value is None:
-        return "–"
+        return "-"
     text = f"{value:.{places}f}"
     return text[1:] if text.startswith("0.") else text
+
+
+def significant(value: float | None) -> str:
+    """Three significant digits without an exponent; a missing value is a dash."""
+    if value is None:
+        return "-"
+    if abs(value) >= 100:
+        return f"{value:.0f}"
+    return f"{value:.3g}" if abs(value) >= 1e-3 else f"{value:.4f}".rstrip("0").rstrip(".")
 
 
 def bold_best(cells: list[str], values: Sequence[float | None], largest: bool = True) -> list[str]:
@@ -80,13 +89,13 @@ def _setup(results: dict[str, Any]) -> str:
                 more = ", …" if sequence[kind] > len(sequence[f"first_{kind}"]) else ""
                 line += f"; left out {sequence[kind]} frames {what} ({named}{more})"
         lines.append(line)
-    for skipped in results.get("skipped_frontends", ()):
-        lines.append(f"- frontend {skipped['frontend']} not run: {skipped['reason']}")
-    return (
-        f"At most {settings['max_keypoints']} keypoints, mutual nearest neighbours, {settings['depth_sampling']} depth, "
-        f"seed {settings['seed']}; success is strictly below {settings['max_rotation_deg']:g}° and "
-        f"{100 * settings['max_translation_m']:g} cm.\n\n" + "\n".join(lines)
-    )
+    lines += [f"- frontend {s['frontend']} not run: {s['reason']}" for s in results.get("skipped_frontends", ())]
+    rules = [
+        f"At most {settings['max_keypoints']} keypoints, mutual nearest neighbours",
+        f"{settings['depth_sampling']} depth, seed {settings['seed']}; success is strictly below",
+    ]
+    limits = f"{settings['max_rotation_deg']:g}° and {100 * settings['max_translation_m']:g} cm."
+    return f"{', '.join(rules)} {limits}\n\n" + "\n".join(lines)
 
 
 def _cell(rows: list[dict[str, Any]], frontend: str, estimator: str, gap: int, field: str) -> Any:
@@ -123,7 +132,7 @@ def _intervals(results: dict[str, Any], estimator: str) -> str:
         for gap in gaps:
             header.append(f"{name} {gap}")
             spans = [_cell(results["rows"], frontend, estimator, gap, f"{field}_interval") for frontend in frontends]
-            columns.append([f"{decimals(low, 2)}–{decimals(high, 2)}" for low, high in spans])
+            columns.append([f"{decimals(low, 2)}-{decimals(high, 2)}" for low, high in spans])
     return markdown(header, columns_to_rows(frontends, columns))
 
 
