@@ -41,3 +41,13 @@ def load_frontend(name: str, max_keypoints: int = 1000, **options: Any) -> Front
         raise ConfigError(f"frontend {name!r}: {error}") from None
     known = ", ".join((*NETWORKS, *CLASSICAL))
     raise ConfigError(f"frontend {name!r}: unknown; choose among {known}, or give a .safetensors weights file")
+
+
+def load_odometry_frontend(name: str, max_keypoints: int = 1000) -> Frontend:
+    """As `load_frontend`, with the classical frontends tuned for odometry: weak points too, spread over the image."""
+    options: dict[str, Any] = {}
+    if name in CLASSICAL:
+        options["sensitive"] = True
+    if name == "orb":
+        options["spread"] = True
+    return load_frontend(name, max_keypoints, **options)

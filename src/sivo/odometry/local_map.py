@@ -15,7 +15,7 @@ from sivo.odometry.refind import match_by_projection
 from sivo.odometry.settings import OdometrySettings
 from sivo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_points
 from sivo.tracking.matching import match_units
-from sivo.types import Float64, Int64
+from sivo.types import Float32, Float64, Int64
 
 
 class LocalMap:
@@ -109,7 +109,7 @@ class LocalMap:
         )
         view.points[free[pairs[:, 1]]] = ids[inside][pairs[:, 0]]
 
-    def _lost_points(self, view: View) -> tuple[Int64, Float64]:
+    def _lost_points(self, view: View) -> tuple[Int64, Float32]:
         """Ids (L,) of recently seen points that `view` does not observe, with their last descriptors (L, D)."""
         ids, descriptors = [np.zeros(0, np.int64)], [view.descriptors[:0]]
         last_seen = self.store.last_seen

@@ -15,7 +15,7 @@ from sivo.odometry.settings import OdometrySettings
 from sivo.odometry.view import View
 from sivo.tracking.connect import TrackChain
 from sivo.tracking.matching import distance_threshold, match_units, unit_descriptors
-from sivo.types import Features, Frame, SparseMap, Trajectory
+from sivo.types import Features, Float64, Frame, SparseMap, Trajectory
 
 
 class VisualOdometry:
@@ -76,6 +76,12 @@ class VisualOdometry:
     def map(self) -> SparseMap:
         """Points of finished segments; all of them after `finish`."""
         return self._journal.map
+
+    @property
+    def running_points(self) -> Float64:
+        """(P, 3) points of the running segment, in its own world as `View.cam_from_world` is."""
+        local_map = None if self._mapper is None else self._mapper.local_map
+        return np.zeros((0, 3)) if local_map is None else local_map.store.xyz
 
     @property
     def segments(self) -> Sequence[Segment]:

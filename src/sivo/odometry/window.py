@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sivo.backend.problem import BundleProblem
+from sivo.backend.problem import BundleProblem, BundleResult
 from sivo.backend.settings import ObjectiveSettings, SolverSettings
-from sivo.backend.solver import BundleResult, solve
+from sivo.backend.solver import solve
 from sivo.odometry.view import NO_POINT, Mask, PointStore, View
 from sivo.types import Float64, Int64
 
@@ -124,11 +124,11 @@ def _solve(
         solver,
     )
     store.xyz[observations.ids] = result.points
-    for i in np.flatnonzero(~fixed):
+    for i in np.flatnonzero(~fixed).tolist():
         views[i].cam_from_world = result.cam_from_world[i]
     return result
 
 
 def _drop(views: Sequence[View], observations: _Observations, bad: Mask) -> None:
-    for i in np.unique(observations.camera[bad]):
+    for i in np.unique(observations.camera[bad]).tolist():
         views[i].points[observations.row[bad & (observations.camera == i)]] = NO_POINT

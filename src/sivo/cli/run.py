@@ -1,0 +1,117 @@
+"""`sivo run SEQUENCE -o OUT`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sivo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from sivo.odometry.run_settings import RunSettings
+
+if TYPE_CHECKING:
+    from sivo.odometry.run import RunSummary
+    from sivo.sequences import Sequence
+
+_FLAGS = {
+    "frontend": "frontend.name",
+    "max_keypoints": "frontend.max_keypoints",
+    "initialisation": "odometry.initialisation",
+    "seed": "odometry.seed",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `sivo run`."""
+    defaults = RunSettings()
+    parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a video, an image folder or a data set")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
+    parser.add_argument(
+        "--frontend",
+        default=argparse.SUPPRESS,
+        metavar="NAME",
+        help=f"sift, orb, akaze, surf, a bundled network or a .safetensors file (default: {defaults.frontend.name})",
+    )
+    parser.add_argument(
+        "--max-keypoints",
+        type=int,
+        default=argparse.SUPPRESS,
+        metavar="N",
+        help=f"per frame (default: {defaults.frontend.max_keypoints})",
+    )
+    parser.add_argument(
+        "--initialisation",
+        choices=("robust", "paper"),
+        default=argparse.SUPPRESS,
+        help="robust, or the paper's: previous pose, unit depth, nothing else (default: robust)",
+    )
+    parser.add_argument(
+        "--no-stability", action="store_true", help="weigh all observations alike (default: by stability)"
+    )
+    parser.add_argument("--seed", type=int, default=argparse.SUPPRESS, help="of all random choices (default: 0)")
+    add_sequence_arguments(parser)
+    add_config_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Track the sequence and write the results; 130 after an interrupt."""
+    settings = settings_from(RunSettings, arguments, _FLAGS)
+    if arguments.no_stability:
+        settings = settings_from(RunSettings, arguments, _FLAGS, extra=["frontend.use_stability=false"])
+    from sivo.files import check_output_folder
+    from sivo.sequences import open_sequence
+
+    check_output_folder(arguments.output, "run")
+    sequence = open_sequence(arguments.sequence, settings.sequence)
+    camera = sequence.camera
+    print(
+        f"{sequence.name}: {sequence.format}, {len(sequence)} frames of {camera.width}x{camera.height}; "
+        f"frontend {settings.frontend.name}; poses and map are up to scale"
+    )
+    summary = _track(sequence, arguments.output, settings)
+    _print_summary(summary)
+    return 130 if summary.report["interrupted"] else 0
+
+
+def _track(sequence: Sequence, folder: Path, settings: RunSettings) -> RunSummary:
+    """The run with its progress line."""
+    from tqdm import tqdm
+
+    from sivo.backend.compile import compile_kernels
+    from sivo.odometry.run import run_odometry
+
+    compile_kernels(lambda words: print(words, file=sys.stderr))
+    lost = 0
+    with tqdm(total=len(sequence), unit="frame", desc="run", smoothing=0.1) as bar:
+
+        def progress(view: object) -> None:
+            nonlocal lost
+            lost += getattr(view, "cam_from_world", None) is None
+            bar.update()
+            if lost:
+                bar.set_postfix(without_pose=lost, refresh=False)
+
+        return run_odometry(sequence, folder, settings, progress=progress)
+
+
+def _print_summary(summary: RunSummary) -> None:
+    report = summary.report
+    frames, segments = report["frames"], report["segments"]
+    print(
+        f"{frames['tracked']} of {frames['processed']} frames have a pose, in {len(segments)} segment(s); "
+        f"{report['points']} points; {report['frames_per_second']} frames/s"
+    )
+    for segment in segments[1:] if len(segments) > 1 else []:
+        print(f"  segment {segment['number']} starts at frame {segment['first']}: own scale, placed by guess")
+    warnings = [event for event in report["events"] if event["kind"] in ("lost", "contradiction")]
+    for event in warnings[:5]:
+        print(f"  frame {event['position']}: {event['kind']}: {event['detail']}")
+    if len(warnings) > 5:
+        print(f"  ... {len(warnings) - 5} more in run.json")
+    skipped = report["input"]["skipped"]
+    if skipped:
+        print(f"  {len(skipped)} frame(s) could not be read, first {skipped[0]['source']}: {skipped[0]['reason']}")
+    if report["interrupted"]:
+        print("  interrupted: the result ends there, and is complete up to there")
+    print(f"results in {summary.folder}; `sivo show map {summary.folder}` draws them")

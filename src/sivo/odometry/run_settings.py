@@ -1,0 +1,35 @@
+"""All settings of `sivo run`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from sivo.errors import ConfigError
+from sivo.labeling.settings import LabelSettings
+from sivo.odometry.settings import OdometrySettings
+from sivo.sequences.base import SequenceSettings
+
+DEFAULT_FRONTEND = "sift"
+
+
+@dataclass(frozen=True)
+class FrontendSettings:
+    """Which frontend, and how many of its keypoints."""
+
+    name: str = DEFAULT_FRONTEND  # sift, orb, akaze, surf, a bundled network, or a .safetensors file
+    max_keypoints: int = 1000
+    use_stability: bool = True  # weigh observations with the frontend's stability, where it has one
+
+    def __post_init__(self) -> None:
+        if self.max_keypoints < 50:
+            raise ConfigError(f"max_keypoints={self.max_keypoints}: odometry needs at least 50; 1000 is a good start")
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Everything that a run depends on; `run.json` records it."""
+
+    sequence: SequenceSettings = field(default_factory=SequenceSettings)
+    frontend: FrontendSettings = field(default_factory=FrontendSettings)
+    odometry: OdometrySettings = field(default_factory=OdometrySettings)
+    labels: LabelSettings = field(default_factory=LabelSettings)
