@@ -28,6 +28,7 @@ class SequenceSettings:
     stride: int = 1  # every n-th frame
     max_frames: int | None = None  # after the stride
     width: int | None = None  # resize to this width, keeping the aspect ratio
+    topic: str | None = None  # the image topic of a ROS bag, or the camera of a recording with several (cam1, image_3)
 
 
 class Recording(ABC):

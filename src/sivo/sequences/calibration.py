@@ -19,7 +19,7 @@ from sivo.geometry.camera import Camera
 _MEND = "expected fx,fy,cx,cy[,k1,k2,p1,p2[,k3]] or a calibration file (sivo, OpenCV, ROS, Kalibr, EuRoC, COLMAP)"
 
 # the names that other tools have for our distortion models
-_MODEL_NAMES = {
+MODEL_NAMES = {
     "": "brown",
     "none": "brown",
     "pinhole": "brown",
@@ -90,7 +90,7 @@ def load_calibration(text: str, camera: str | None = None) -> Calibration:
     """A calibration from `fx,fy,cx,cy[,...]` or from a file in any of the notations above.
 
     Args:
-        text: numbers, or the path of a file.
+        text: numbers, or the path of a file, with `#NAME` to choose one of several cameras in it.
         camera: which camera of a file with several (`cam0`, COLMAP's id); None is the first.
 
     Raises:
@@ -99,6 +99,9 @@ def load_calibration(text: str, camera: str | None = None) -> Calibration:
     if re.fullmatch(r"[\s\d.,eE+-]+", text) and "," in text:
         return _from_numbers(text)
     path = Path(text)
+    if not path.is_file() and "#" in text:
+        name, _, camera = text.rpartition("#")
+        path = Path(name)
     if not path.is_file():
         raise InputError(f"--camera {text}: no such file; {_MEND}")
     try:
@@ -107,7 +110,7 @@ def load_calibration(text: str, camera: str | None = None) -> Calibration:
         raise InputError(f"{path}: cannot be read as a calibration ({error}); {_MEND}") from None
     if path.suffix.lower() == ".txt":
         return _from_colmap(content, path, camera)
-    return _from_mapping(_parse_yaml(content, path), path, camera)
+    return _from_mapping(parse_yaml(content, path), path, camera)
 
 
 def folder_calibration(folder: Path, names: tuple[str, ...] = ("camera.yaml", "camera.yml")) -> Calibration | None:
@@ -139,7 +142,12 @@ def _from_numbers(text: str) -> Calibration:
     return _checked(Calibration("--camera", _four(numbers[:4]), tuple(numbers[4:])))
 
 
-def _parse_yaml(content: str, path: Path) -> dict[str, Any]:
+def parse_yaml(content: str, path: Path) -> dict[str, Any]:
+    """The mapping in a YAML file, also in OpenCV's dialect.
+
+    Raises:
+        InputError: not YAML, or no mapping.
+    """
     import yaml
 
     # OpenCV's FileStorage starts with "%YAML:1.0" and tags matrices, neither of which is YAML 1.1
@@ -191,7 +199,7 @@ def _interpret(mapping: dict[str, Any], source: str) -> Calibration:
     return Calibration(
         source,
         intrinsics,
-        _usual_length(distortion, _model(model)),
+        usual_length(distortion, _model(model)),
         _model(model),
         _size(mapping),
         _optional(mapping, "fps", "rate_hz"),
@@ -262,7 +270,7 @@ def _four(values: list[float] | tuple[float, ...]) -> tuple[float, float, float,
     return fx, fy, cx, cy
 
 
-def _usual_length(distortion: tuple[float, ...], model: str) -> tuple[float, ...]:
+def usual_length(distortion: tuple[float, ...], model: str) -> tuple[float, ...]:
     """Brown coefficients without zeros beyond the eighth, and with zeros up to the fourth."""
     if model != "brown":
         return distortion
@@ -274,7 +282,7 @@ def _usual_length(distortion: tuple[float, ...], model: str) -> tuple[float, ...
 
 
 def _model(name: Any) -> str:
-    model = _MODEL_NAMES.get(str(name or "").strip().lower())
+    model = MODEL_NAMES.get(str(name or "").strip().lower())
     if model is None:
         raise ValueError(f"distortion model {name!r} is not supported; known: brown, fisheye, fov")
     return model

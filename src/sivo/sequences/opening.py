@@ -5,17 +5,31 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterator
 from dataclasses import replace
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
 from sivo.errors import ConfigError, InputError
 from sivo.sequences.base import Recording, SequenceSettings
+from sivo.sequences.live import LiveStream, is_live
+from sivo.sequences.live_sequence import LiveSequence
 from sivo.sequences.sequence import Sequence
+
+ENTRY_POINT = "sivo.recordings"  # the group under which other packages offer their readers
 
 # format -> class; the most telling layouts first, the plain image folder last
 FORMATS: dict[str, str] = {
+    "live": "sivo.sequences.live:LiveStream",
+    "sens": "sivo.sequences.scannet_sens:ScanNetSens",
+    "rosbag": "sivo.sequences.ros_bag:RosBag",
+    "record3d": "sivo.sequences.record3d:Record3d",
+    "nerfstudio": "sivo.sequences.nerfstudio:Nerfstudio",
+    "polycam": "sivo.sequences.polycam:Polycam",
+    "scannet": "sivo.sequences.scannet_folder:ScanNetFolder",
     "7scenes": "sivo.sequences.seven_scenes:SevenScenes",
+    "icl": "sivo.sequences.icl_nuim:IclNuim",
     "tum": "sivo.sequences.tum_rgbd:TumRgbd",
+    "euroc": "sivo.sequences.euroc:EurocMav",
     "kitti": "sivo.sequences.kitti_odometry:KittiOdometry",
     "video": "sivo.sequences.video_file:VideoFile",
     "images": "sivo.sequences.image_folder:ImageFolder",
@@ -26,7 +40,7 @@ def open_sequence(path: Path | str, settings: SequenceSettings | None = None, **
     """Open any recording by its path.
 
     Args:
-        path: a video file, an image folder, or the folder of a data set.
+        path: a video file, an image folder, a data set, a bag, the number of a webcam, or the address of a stream.
         settings: how to read it; keyword arguments replace single fields (`stride=2`, `camera="camera.yaml"`).
 
     Raises:
@@ -34,7 +48,10 @@ def open_sequence(path: Path | str, settings: SequenceSettings | None = None, **
         ConfigError: an unknown setting or format.
     """
     settings = _with_overrides(settings, overrides)
-    return Sequence(open_recording(path, settings), settings)
+    recording = open_recording(path, settings)
+    if isinstance(recording, LiveStream):
+        return LiveSequence(recording, settings)
+    return Sequence(recording, settings)
 
 
 def open_recording(path: Path | str, settings: SequenceSettings | None = None, **overrides: Any) -> Recording:
@@ -43,37 +60,60 @@ def open_recording(path: Path | str, settings: SequenceSettings | None = None, *
     path = Path(path)
     if settings.fps is not None and not settings.fps > 0:
         raise InputError(f"{path}: fps {settings.fps:g} must be positive")
-    if not path.exists():
+    live = is_live(str(path))
+    if not live and not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
     if path.is_dir() and not any(path.iterdir()):
         raise InputError(f"{path}: the folder is empty; give a video, an image folder or a data set")
     if settings.format == "auto":
-        chosen = next((recording for _, recording in _formats() if recording.recognises(path)), None)
+        chosen = next((recording for recording in _formats() if recording.recognises(path)), None)
         if chosen is None:
             raise InputError(
                 f"{path}: not recognised as any of {', '.join(format_names())}; name it with --format if it is one"
             )
     else:
         chosen = _format(settings.format)
-    return chosen(path, settings)
+    try:
+        return chosen(path, settings)
+    except OSError as error:
+        raise InputError(
+            f"{error.filename or path}: {error.strerror or error}; check the path and permissions"
+        ) from None
 
 
 def format_names() -> list[str]:
-    """The names for --format, `auto` left out."""
-    return list(FORMATS)
+    """The names for --format, `auto` left out: our own and those of installed readers."""
+    return [*_installed(), *FORMATS]
 
 
-def _formats() -> Iterator[tuple[str, type[Recording]]]:
-    for name in FORMATS:
-        yield name, _format(name)
+def _formats() -> Iterator[type[Recording]]:
+    """Installed readers first, so that they can take over a layout of ours."""
+    for name in format_names():
+        yield _format(name)
 
 
 def _format(name: str) -> type[Recording]:
+    installed = _installed()
+    if name in installed:
+        try:
+            return _checked(installed[name].load(), installed[name].value)
+        except (ImportError, AttributeError) as error:
+            raise InputError(f"reader `{name}` ({installed[name].value}) cannot be imported: {error}") from None
     if name not in FORMATS:
         raise ConfigError(f"--format {name}: unknown; known: auto, {', '.join(format_names())}")
     module, _, attribute = FORMATS[name].partition(":")
     recording: type[Recording] = getattr(importlib.import_module(module), attribute)
     return recording
+
+
+def _installed() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=ENTRY_POINT)}
+
+
+def _checked(reader: Any, where: str) -> type[Recording]:
+    if not (isinstance(reader, type) and issubclass(reader, Recording)):
+        raise InputError(f"reader {where}: must be a subclass of sivo.sequences.Recording; see docs/recordings.md")
+    return reader
 
 
 def _with_overrides(settings: SequenceSettings | None, overrides: dict[str, Any]) -> SequenceSettings:

@@ -32,19 +32,23 @@ class Sequence:
     """
 
     def __init__(self, recording: Recording, settings: SequenceSettings) -> None:
+        self.indices = _selected(recording, settings)  # (N,) rows of the recording
+        height, width = _probe(recording, self.indices).shape[:2]
+        self._set_up(recording, settings, width, height)
+
+    def _set_up(self, recording: Recording, settings: SequenceSettings, width: int, height: int) -> None:
+        """Everything that follows from the size of the raw images."""
         self.recording = recording
         self.settings = settings
         self.path: Path = recording.path
         self.format = recording.format
         self.name = _name(recording.path)
-        self.indices = _selected(recording, settings)  # (N,) rows of the recording
         self._skipped: dict[int, SkippedFrame] = {}
-        height, width = self._probe().shape[:2]
-        self._calibration = _calibration(recording, settings, width, height)
         self._raw_size = (width, height)
         if settings.width is not None and settings.width < 8:
             raise InputError(f"{self.path}: width {settings.width} is too small; choose at least 8 pixels")
-        self._rectifier = Rectifier(self._calibration.camera(width, height), settings.width)
+        calibration = _calibration(recording, settings, width, height)
+        self._rectifier = Rectifier(calibration.camera(width, height), settings.width)
 
     @property
     def camera(self) -> Camera:
@@ -139,15 +143,16 @@ class Sequence:
             raise UnreadableFrameError(f"is {size[0]}x{size[1]} in a recording of {first}")
         return image
 
-    def _probe(self) -> UInt8:
-        """The first readable image, for its size."""
-        reasons = []
-        for index in self.indices[:_PROBES].tolist():
-            image, reason = _image_or_reason(self.recording, index)
-            if image is not None:
-                return image
-            reasons.append(f"{self.recording.source(index)}: {reason}")
-        raise InputError(f"{self.path}: none of the first frames can be read ({reasons[0]}); check the recording")
+
+def _probe(recording: Recording, indices: Int64) -> UInt8:
+    """The first readable image, for its size."""
+    reasons = []
+    for index in indices[:_PROBES].tolist():
+        image, reason = _image_or_reason(recording, index)
+        if image is not None:
+            return image
+        reasons.append(f"{recording.source(index)}: {reason}")
+    raise InputError(f"{recording.path}: none of the first frames can be read ({reasons[0]}); check the recording")
 
 
 def _image_or_reason(recording: Recording, index: int) -> tuple[UInt8 | None, str]:

@@ -17,8 +17,9 @@ from sivo.sequences.base import Recording, SequenceSettings
 from sivo.sequences.calibration import Calibration, folder_calibration
 from sivo.sequences.image_folder import frame_rate
 from sivo.sequences.images import IMAGE_SUFFIXES, read_depth, read_image
+from sivo.sequences.scannet_folder import read_matrix
 from sivo.sequences.trajectory_files import clean_poses
-from sivo.types import Float32, Float64, Trajectory, UInt8
+from sivo.types import Float32, Trajectory, UInt8
 
 DEPTH_SCALE = 1000.0
 FPS = 30.0
@@ -79,7 +80,7 @@ class SevenScenes(Recording):
         if not present:
             return None, []
         for row in present:
-            matrices[row] = _read_matrix(files[row])
+            matrices[row] = read_matrix(files[row])
         poses, not_finite, not_rigid = clean_poses(matrices)
         missing = set(range(len(files))) - set(present)
         bad = [files[row].name for row in sorted({*not_finite.tolist(), *not_rigid.tolist()} - missing)]
@@ -90,14 +91,6 @@ class SevenScenes(Recording):
         shown = ", ".join(bad[:5]) + (", ..." if len(bad) > 5 else "")
         problems = [f"{self.path}: {len(bad)} pose files hold no rigid pose ({shown})"] if bad else []
         return Trajectory(self.times, poses), problems
-
-
-def _read_matrix(path: Path) -> Float64:
-    """(4, 4) from a text file, NaN if it holds anything else."""
-    try:
-        return np.array(path.read_text(encoding="utf-8").split(), np.float64).reshape(4, 4)
-    except (OSError, UnicodeDecodeError, ValueError):
-        return np.full((4, 4), np.nan)
 
 
 def _colour_files(path: Path) -> Iterator[tuple[Path, re.Match[str]]]:
