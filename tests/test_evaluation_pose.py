@@ -18,9 +18,9 @@ from sivo.evaluation.estimators import with_opencv, with_poselib
 from sivo.evaluation.measures import PairGeometry, PoseError, repeated_keypoints, right_matches
 from sivo.evaluation.pairs import draw_pairs, pairs_of_sequence
 from sivo.evaluation.parallel import Workers
-from sivo.evaluation.pose import PoseSettings
 from sivo.evaluation.pose_results import results
 from sivo.evaluation.pose_run import run_pose_protocol
+from sivo.evaluation.settings import PoseSettings
 from sivo.evaluation.statistics import Bootstrap, accuracy_curve, area_shares, below
 from sivo.evaluation.tables import pose_tables
 from sivo.geometry.se3 import inverse, rigid, so3_exp

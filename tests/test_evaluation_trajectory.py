@@ -15,7 +15,8 @@ import pytest
 
 from sivo.errors import ConfigError, InputError
 from sivo.evaluation.relative import window_pairs
-from sivo.evaluation.trajectory import TrajectorySettings, associate, clean_truth, evaluate_trajectory
+from sivo.evaluation.settings import TrajectorySettings
+from sivo.evaluation.trajectory import associate, clean_truth, evaluate_trajectory
 from sivo.geometry.alignment import Similarity
 from sivo.geometry.se3 import nearest_rotation, rigid, so3_exp
 from sivo.sequences.trajectory_files import read_trajectory

@@ -7,7 +7,12 @@ import importlib
 
 from sivo.cli.options import add_config_arguments
 
-SETTINGS = {"run": "sivo.odometry.run_settings:RunSettings"}  # command -> its settings
+SETTINGS = {  # command -> its settings
+    "run": "sivo.odometry.run_settings:RunSettings",
+    "evaluate-pose": "sivo.evaluation.settings:PoseCommandSettings",
+    "evaluate-trajectory": "sivo.evaluation.settings:TrajectoryCommandSettings",
+    "evaluate-homography": "sivo.evaluation.settings:HomographyCommandSettings",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

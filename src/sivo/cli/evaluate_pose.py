@@ -12,35 +12,62 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sivo.cli.evaluate_options import add_feature_arguments, add_run_arguments, add_sequence_arguments
+from sivo.cli.evaluate_options import add_frontend_arguments, add_run_arguments
+from sivo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
 from sivo.errors import InputError, SivoError
+from sivo.evaluation.settings import ESTIMATORS, SAMPLINGS, PoseCommandSettings, PoseSettings
 
 if TYPE_CHECKING:
-    from sivo.evaluation.pose import PoseSettings
     from sivo.evaluation.sources import FeatureSource, Recorded
 
 COMMAND = "evaluate pose"
 
 
+_FLAGS = {
+    "gaps": "pose.gaps",
+    "pairs": "pose.pairs",
+    "estimator": "pose.estimators",
+    "depth_sampling": "pose.depth_sampling",
+    "max_keypoints": "pose.max_keypoints",
+    "seed": "pose.seed",
+}
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `sivo evaluate pose`."""
-    parser.add_argument("sequences", nargs="*", metavar="SEQUENCE", help="sequences with depth and true poses")
-    add_feature_arguments(parser)
-    parser.add_argument("--gaps", nargs="+", type=int, default=[30, 60, 90], help="frames between the two images")
-    parser.add_argument("--pairs", type=int, default=50, help="random pairs per sequence and gap")
+    defaults, absent = PoseSettings(), argparse.SUPPRESS
+    parser.add_argument("sequences", nargs="*", type=Path, metavar="SEQUENCE", help="with depth and true poses")
+    add_frontend_arguments(parser, defaults.max_keypoints)
+    parser.add_argument(
+        "--features",
+        action="append",
+        default=[],
+        metavar="[LABEL=]PATH",
+        help="features exported by another program: a folder of NPZ files, or an HDF5 file of hloc; repeatable",
+    )
+    gaps = " ".join(map(str, defaults.gaps))
+    parser.add_argument(
+        "--gaps", nargs="+", type=int, default=absent, help=f"frames between the two images (default: {gaps})"
+    )
+    parser.add_argument(
+        "--pairs", type=int, default=absent, metavar="N", help=f"per sequence and gap (default: {defaults.pairs})"
+    )
     parser.add_argument(
         "--estimator",
         nargs="+",
-        choices=("opencv", "poselib"),
-        default=["opencv", "poselib"],
-        help="opencv: default solvePnPRansac, the paper's; poselib: a robust one",
+        choices=ESTIMATORS,
+        default=absent,
+        help="opencv: default solvePnPRansac, the paper's; poselib: a robust one (default: both)",
     )
-    parser.add_argument("--depth-sampling", choices=("bilinear", "nearest"), default="bilinear", help="of image A")
+    parser.add_argument(
+        "--depth-sampling", choices=SAMPLINGS, default=absent, help=f"(default: {defaults.depth_sampling})"
+    )
     parser.add_argument("--per-sequence", action="store_true", help="print the table of each sequence too")
     parser.add_argument("--from", dest="results", type=Path, metavar="POSE.JSON", help="print an earlier run again")
     parser.add_argument("--export-images", type=Path, metavar="DIR", help="write the frames of all pairs, and stop")
     add_run_arguments(parser)
     add_sequence_arguments(parser)
+    add_config_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> int | None:
@@ -76,32 +103,22 @@ def read_results(path: Path) -> dict[str, Any]:
     return results
 
 
-def _settings(arguments: argparse.Namespace) -> PoseSettings:
-    from sivo.evaluation.pose import PoseSettings
-
-    return PoseSettings(
-        gaps=tuple(arguments.gaps),
-        pairs=arguments.pairs,
-        max_keypoints=arguments.max_keypoints,
-        estimators=tuple(arguments.estimator),
-        seed=arguments.seed,
-        depth_sampling=arguments.depth_sampling,
-    )
-
-
 def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     from sivo import __version__
-    from sivo.cli.evaluate_options import feature_sources, sequence_sources
+    from sivo.cli.evaluate_options import exported_features, loaded_frontends
     from sivo.evaluation.parallel import Workers
     from sivo.evaluation.pose_results import results, write_records
     from sivo.evaluation.pose_run import run_pose_protocol
     from sivo.files import make_output_folder, write_json
 
-    settings, sources = _settings(arguments), sequence_sources(arguments)
+    settings, sources = _settings(arguments)
     output: Path | None = arguments.output
     if output is not None:
         make_output_folder(output, COMMAND)
-    frontends, skipped = feature_sources(arguments, one_sequence=len(sources) == 1)
+    default = [] if arguments.features else None
+    loaded, skipped = loaded_frontends(arguments.frontend, settings.max_keypoints, default)
+    exported = exported_features(arguments.features, settings.max_keypoints, one_sequence=len(sources) == 1)
+    frontends = [*loaded, *exported]
     request = _request(settings, sources, frontends)
     if output is not None and (output / "pose.json").is_file():
         earlier = read_results(output / "pose.json")
@@ -117,6 +134,13 @@ def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         _write_text(found, output)
         _draw(found, output)
     return found
+
+
+def _settings(arguments: argparse.Namespace) -> tuple[PoseSettings, list[Recorded]]:
+    from sivo.evaluation.sources import Recorded
+
+    settings = settings_from(PoseCommandSettings, arguments, _FLAGS)
+    return settings.pose, [Recorded(str(path), settings.sequence) for path in arguments.sequences]
 
 
 def _request(settings: PoseSettings, sources: list[Recorded], frontends: list[FeatureSource]) -> dict[str, Any]:
@@ -149,15 +173,15 @@ def _export(arguments: argparse.Namespace) -> int:
     """Write the frames that the evaluation will use, as delivered, for a frontend that runs elsewhere."""
     import cv2
 
-    from sivo.cli.evaluate_options import sequence_sources
     from sivo.evaluation.pairs import pairs_of_sequence
     from sivo.files import make_output_folder, written_atomically
 
     make_output_folder(arguments.export_images, f"{COMMAND} --export-images")
+    settings, sources = _settings(arguments)
     written = 0
-    for source in sequence_sources(arguments):
+    for source in sources:
         sequence = source.open()
-        drawn = pairs_of_sequence(sequence, tuple(arguments.gaps), arguments.pairs, arguments.seed)
+        drawn = pairs_of_sequence(sequence, settings.gaps, settings.pairs, settings.seed)
         folder = arguments.export_images / sequence.name
         folder.mkdir(exist_ok=True)
         for row in sorted({int(i) for pairs in drawn.pairs.values() for i in pairs.ravel()}):

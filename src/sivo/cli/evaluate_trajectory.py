@@ -10,14 +10,22 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sivo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
 from sivo.errors import InputError
+from sivo.evaluation.settings import ALIGNMENTS, TrajectoryCommandSettings, TrajectorySettings
+from sivo.sequences.base import SequenceSettings
 
 if TYPE_CHECKING:
-    from sivo.evaluation.trajectory import TrajectorySettings
     from sivo.types import Trajectory
 
 COMMAND = "evaluate trajectory"
-KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+KITTI_LENGTHS = [100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0]
+TRAJECTORY_FLAGS = {
+    "alignment": "trajectory.alignment",
+    "windows": "trajectory.time_windows",
+    "distances": "trajectory.distance_windows",
+    "max_time_difference": "trajectory.max_time_difference",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,26 +34,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("truth", type=Path, metavar="TRUTH")
     add_trajectory_arguments(parser)
     parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="folder for trajectory.json and trajectory.md")
+    add_sequence_arguments(parser)
+    add_config_arguments(parser)
 
 
 def add_trajectory_arguments(parser: argparse.ArgumentParser) -> None:
     """Alignment and windows, shared with `sivo evaluate vo`."""
-    parser.add_argument("--alignment", choices=("sim3", "se3", "none"), default="sim3", help="of the estimate")
-    parser.add_argument("--windows", nargs="+", type=float, default=[2.0, 5.0, 10.0], help="sub-trajectories, seconds")
-    parser.add_argument("--distances", nargs="*", type=float, default=[], help="sub-trajectories, metres")
-    parser.add_argument("--kitti", action="store_true", help="sub-trajectories of 100, 200, ... 800 m")
-    parser.add_argument("--max-time-difference", type=float, default=0.02, help="between estimate and truth, seconds")
-
-
-def trajectory_settings(arguments: argparse.Namespace) -> TrajectorySettings:
-    """The settings that the arguments of `add_trajectory_arguments` mean."""
-    from sivo.evaluation.trajectory import TrajectorySettings
-
-    return TrajectorySettings(
-        alignment=arguments.alignment,
-        max_time_difference=arguments.max_time_difference,
-        time_windows=tuple(arguments.windows),
-        distance_windows=(*arguments.distances, *(KITTI_LENGTHS if arguments.kitti else ())),
+    defaults, absent = TrajectorySettings(), argparse.SUPPRESS
+    parser.add_argument(
+        "--alignment", choices=ALIGNMENTS, default=absent, help=f"of the estimate (default: {defaults.alignment})"
+    )
+    windows = " ".join(f"{window:g}" for window in defaults.time_windows)
+    parser.add_argument(
+        "--windows", nargs="+", type=float, default=absent, help=f"sub-trajectories, seconds (default: {windows})"
+    )
+    distances = parser.add_mutually_exclusive_group()
+    distances.add_argument("--distances", nargs="+", type=float, default=absent, help="sub-trajectories, metres")
+    distances.add_argument(
+        "--kitti",
+        dest="distances",
+        action="store_const",
+        const=KITTI_LENGTHS,
+        default=absent,
+        help="sub-trajectories of 100, 200, ... 800 m",
+    )
+    parser.add_argument(
+        "--max-time-difference",
+        type=float,
+        default=absent,
+        metavar="SECONDS",
+        help=f"between estimate and truth (default: {defaults.max_time_difference})",
     )
 
 
@@ -56,10 +74,11 @@ def run(arguments: argparse.Namespace) -> int | None:
     from sivo.evaluation.trajectory_tables import trajectory_tables
     from sivo.files import make_output_folder, write_json, write_text
 
-    settings = trajectory_settings(arguments)
+    command = settings_from(TrajectoryCommandSettings, arguments, TRAJECTORY_FLAGS)
+    settings = command.trajectory
     if arguments.output is not None:
         make_output_folder(arguments.output, COMMAND)
-    estimate, truth, notes = read_pair(arguments.estimate, arguments.truth)
+    estimate, truth, notes = read_pair(arguments.estimate, arguments.truth, command.sequence)
     errors = evaluate_trajectory(estimate, truth, settings, (str(arguments.estimate), str(arguments.truth)))
     result = {
         "protocol": "trajectory",
@@ -77,7 +96,9 @@ def run(arguments: argparse.Namespace) -> int | None:
     return 0
 
 
-def read_pair(estimate_path: Path, truth_path: Path) -> tuple[Trajectory, Trajectory, tuple[str, ...]]:
+def read_pair(
+    estimate_path: Path, truth_path: Path, sequence: SequenceSettings | None = None
+) -> tuple[Trajectory, Trajectory, tuple[str, ...]]:
     """Both trajectories, and what was odd in their files. Two KITTI files of one length count the same frames.
 
     Raises:
@@ -88,7 +109,7 @@ def read_pair(estimate_path: Path, truth_path: Path) -> tuple[Trajectory, Trajec
     from sivo.types import Trajectory
 
     if truth_path.is_dir():
-        truth, truth_notes = open_sequence(truth_path).ground_truth, tuple[str, ...]()
+        truth, truth_notes = open_sequence(truth_path, sequence).ground_truth, tuple[str, ...]()
         if truth is None:
             raise InputError(f"{truth_path}: has no true poses; give a trajectory file or a sequence that has them")
     else:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from sivo.errors import ConfigError
+from sivo.evaluation.settings import SAMPLINGS
 from sivo.types import Float32, Float64
-
-SAMPLINGS = ("bilinear", "nearest")
 
 
 def depth_at(keypoints: Float32, depth: Float32, sampling: str = "bilinear", edge: float = 0.05) -> Float64:

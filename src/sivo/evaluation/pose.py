@@ -14,52 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sivo.errors import ConfigError
 from sivo.evaluation.cache import FeatureCache, read_cache
-from sivo.evaluation.depth import SAMPLINGS
+from sivo.evaluation.estimators import ESTIMATORS
 from sivo.evaluation.measures import PairGeometry, PoseError, relative_motion, repeated_keypoints, right_matches
 from sivo.evaluation.pairs import SequencePairs
+from sivo.evaluation.settings import PoseSettings
 from sivo.evaluation.sources import FeatureSource, SequenceSource
 from sivo.geometry.camera import Camera
 from sivo.tracking.matching import mutual_nearest_neighbours
 from sivo.types import Features, Float64, Int64
 
-ESTIMATORS = ("opencv", "poselib")
 CHUNK = 25  # pairs of one task
-
-
-@dataclass(frozen=True)
-class PoseSettings:
-    """The pose protocol; the defaults are the paper's."""
-
-    gaps: tuple[int, ...] = (30, 60, 90)  # frames between A and B, as delivered (after any stride)
-    pairs: int = 50  # random pairs per sequence and gap
-    max_keypoints: int = 500
-    estimators: tuple[str, ...] = ESTIMATORS  # opencv is the paper's solver, poselib a robust one
-    seed: int = 0  # of the pairs, the robust solver and the intervals
-    max_rotation_deg: float = 5.0  # success is strictly below
-    max_translation_m: float = 0.05  # success is strictly below
-    max_error_px: float = 3.0  # a match is right, a keypoint repeated, strictly below this distance from the truth
-    depth_sampling: str = "bilinear"  # bilinear or nearest
-    depth_edge: float = 0.05  # relative depth difference between neighbouring pixels that makes a discontinuity
-    curve_rotation_deg: float = 20.0  # accuracy curves, and the area under them, reach to here
-    curve_translation_m: float = 0.5
-    resamples: int = 1000  # of the bootstrap
-    confidence: float = 0.95  # of the intervals
-
-    def __post_init__(self) -> None:
-        if not self.gaps or min(self.gaps) < 1 or len(set(self.gaps)) < len(self.gaps):
-            raise ConfigError(f"gaps {list(self.gaps)}: give different numbers of frames, each 1 or more")
-        if self.pairs < 1 or self.max_keypoints < 4 or self.resamples < 1:
-            raise ConfigError("pairs and resamples must be at least 1, max_keypoints at least 4")
-        unknown = set(self.estimators) - set(ESTIMATORS)
-        if unknown or not self.estimators:
-            raise ConfigError(f"estimators {list(self.estimators)}: choose among {', '.join(ESTIMATORS)}")
-        if self.depth_sampling not in SAMPLINGS:
-            raise ConfigError(f"depth_sampling `{self.depth_sampling}` is unknown; choose among {', '.join(SAMPLINGS)}")
-        limits = (self.max_rotation_deg, self.max_translation_m, self.max_error_px, self.depth_edge)
-        if min(*limits, self.curve_rotation_deg, self.curve_translation_m) <= 0 or not 0 < self.confidence < 1:
-            raise ConfigError("thresholds must be positive, and confidence between 0 and 1")
 
 
 # One row per pair, frontend and estimator.
@@ -158,9 +123,7 @@ def solve(
     estimator: str, points_a: Float64, pixels_b: Float64, camera: Camera, b_from_a: Float64, seed: int
 ) -> tuple[PoseError, int]:
     """Error of the pose from matches (N, 3) to (N, 2), and its inliers; a failure is an error of inf and 0 inliers."""
-    from sivo.evaluation.estimators import ESTIMATORS as SOLVERS
-
-    estimate = SOLVERS[estimator](points_a, pixels_b, camera, seed)
+    estimate = ESTIMATORS[estimator](points_a, pixels_b, camera, seed)
     if estimate is None:
         return PoseError.of_failure(), 0
     return PoseError.between(b_from_a, estimate.cam_from_world), int(estimate.inliers.sum())

@@ -8,8 +8,9 @@ import numpy as np
 
 from sivo.config import to_dict
 from sivo.evaluation.measures import relative_motion
-from sivo.evaluation.pose import PoseSettings, Records
+from sivo.evaluation.pose import Records
 from sivo.evaluation.pose_run import PoseRun
+from sivo.evaluation.settings import PoseSettings
 from sivo.evaluation.statistics import Bootstrap, accuracy_curve, area_shares, below
 from sivo.geometry.se3 import rotation_angle_deg
 from sivo.types import Float64

@@ -12,7 +12,8 @@ from sivo.errors import ConfigError
 from sivo.evaluation.cache import read_cache, write_cache
 from sivo.evaluation.pairs import SequencePairs, pairs_of_sequence, refuse_empty_gaps
 from sivo.evaluation.parallel import Workers
-from sivo.evaluation.pose import ExtractionTask, PoseSettings, Records, evaluate_pairs, extract, pair_tasks
+from sivo.evaluation.pose import ExtractionTask, Records, evaluate_pairs, extract, pair_tasks
+from sivo.evaluation.settings import PoseSettings
 from sivo.evaluation.sources import FeatureSource, SequenceSource, sequence_fingerprint
 from sivo.types import Features
 

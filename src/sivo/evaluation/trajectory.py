@@ -12,37 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sivo.errors import ConfigError, InputError
+from sivo.errors import InputError
 from sivo.evaluation.relative import RelativeErrors, Spread, path_lengths, relative_errors
+from sivo.evaluation.settings import TrajectorySettings
 from sivo.geometry.alignment import Similarity, align_points
 from sivo.geometry.se3 import rotation_angle_deg
 from sivo.sequences.association import nearest
 from sivo.sequences.trajectory_files import clean_poses
 from sivo.types import Float64, Int64, Trajectory
 
-ALIGNMENTS = ("sim3", "se3", "none")
 CLOCK_DIGITS = 1e-9  # seconds, rounding of a difference of time stamps
-
-
-@dataclass(frozen=True)
-class TrajectorySettings:
-    """How an estimated trajectory is held against the truth."""
-
-    alignment: str = "sim3"  # sim3 (monocular), se3 (metric scale) or none (same world); each segment on its own
-    max_time_difference: float = 0.02  # seconds between an estimated pose and the true one
-    time_windows: tuple[float, ...] = (2.0, 5.0, 10.0)  # sub-trajectories in seconds, paper Table 2
-    distance_windows: tuple[float, ...] = ()  # sub-trajectories in metres; KITTI: 100, 200, ... 800
-    path_fractions: tuple[float, ...] = (0.1, 0.2, 0.3, 0.4, 0.5)  # sub-trajectories as a share of the true path
-    window_tolerance: float = 0.2  # a sub-trajectory may be this share longer or shorter than asked for
-
-    def __post_init__(self) -> None:
-        if self.alignment not in ALIGNMENTS:
-            raise ConfigError(f"alignment `{self.alignment}` is unknown; choose one of {', '.join(ALIGNMENTS)}")
-        lengths = (*self.time_windows, *self.distance_windows, *self.path_fractions, self.window_tolerance)
-        if not np.isfinite(lengths).all() or min(lengths) <= 0:
-            raise ConfigError("sub-trajectory lengths and window_tolerance must be positive numbers")
-        if not self.max_time_difference >= 0:
-            raise ConfigError("max_time_difference must be 0 or more seconds")
 
 
 @dataclass(frozen=True)
