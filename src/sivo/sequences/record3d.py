@@ -1,6 +1,6 @@
 """Record3D's export: an `.r3d` file (a ZIP archive), the unpacked archive, or its `rgb` folder with `metadata.json`.
 
-Depth inside an archive is LZFSE-compressed and needs the package `pyliblzfse`; without it the recording has no depth.
+Depth inside an archive is LZFSE-compressed and needs the extra `record3d`; without it the recording has no depth.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Record3d(Recording):
         poses = _poses(metadata.get("poses"), count)
         self.ground_truth, problems = trajectory_from_opengl(str(path), self.times, poses)
         if self._files.has(self._depth_name(0, ".depth")) and _lzfse() is None:
-            problems.append(f"{path}: its depth needs `pip install pyliblzfse`; it is left out")
+            problems.append(f"{path}: its depth is left out; pip install 'sivo[record3d]' to read it")
         self.notes = (*notes, *problems)
 
     @classmethod

@@ -31,7 +31,7 @@ def register_depth(depth: Float32, depth_camera: Camera, camera: Camera, cam_fro
             )
         )
     rows, columns = np.nonzero(np.isfinite(depth))
-    pixels = np.stack([columns, rows], axis=-1).astype(np.float64)
+    pixels = np.stack([columns, rows], axis=-1)
     points = transform(
         cam_from_depth, depth_camera.unproject(pixels.astype(np.float64), np.asarray(depth[rows, columns], np.float64))
     )
