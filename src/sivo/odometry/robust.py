@@ -211,7 +211,9 @@ class RobustMapper:
             return
         self._map = started
         self._journal.started(self._waiting)
-        self._recent, self._waiting = self._waiting, []
+        self._recent = [v for v in self._waiting if v.cam_from_world is not None]
+        self._journal.give_up([v for v in self._waiting if v.cam_from_world is None])
+        self._waiting = []
         self._young = list(self._recent)
         self._health = HealthCheck(self._camera, self._settings.health, self._descriptor_distance, self._settings.seed)
         for waiting_view in self._recent:

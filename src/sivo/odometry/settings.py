@@ -30,6 +30,7 @@ class StartSettings:
     min_points: int = 30  # over the minimum parallax
     min_inlier_share: float = 0.5  # essential inliers of the matches
     max_mean_error: float = 1.2  # pixels, after adjustment and pruning
+    max_lost_share: float = 0.2  # of the waiting frames, such as black ones, may stay without a pose
 
 
 @dataclass(frozen=True)

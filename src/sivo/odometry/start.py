@@ -125,8 +125,8 @@ def start_map(
     Every other view gets the full step, PnP, triangulation and adjustment, going backwards from the last.
 
     Returns:
-        The map, world = camera of the first view, median depth 1; or why it is too early. After a refusal the views
-        have neither poses nor points.
+        The map, world = camera of the first view that got a pose, median depth 1; or why it is too early. After a
+        refusal the views have neither poses nor points.
     """
     start = settings.start
     b = waiting[-1]
@@ -143,7 +143,7 @@ def start_map(
             view.cam_from_world = None
             view.points[:] = NO_POINT
         return refusal
-    _normalise(waiting, local_map)
+    _normalise([view for view in waiting if view.cam_from_world is not None], local_map)
     return local_map
 
 
@@ -163,12 +163,15 @@ def _grow(
     local_map.remember(a)
     local_map.remember(b)
     done = [b]
-    neighbour = b
+    neighbour, without_pose = b, 0
     for view in reversed(waiting[:-1]):
         if view is not a:
-            inliers, _ = local_map.localise(view, neighbour)
-            if view.cam_from_world is None or inliers < settings.loss.min_inliers:
-                return Refusal("the first views do not fit together", costly=True)
+            local_map.localise(view, neighbour)
+            if view.cam_from_world is None:
+                without_pose += 1
+                if without_pose > settings.start.max_lost_share * len(waiting) + 1:
+                    return Refusal("the first views do not fit together", costly=True)
+                continue
         done.append(view)
         others = [v for v in done[-16:-1] if v is not view]
         local_map.triangulate(view, [*others, *([a] if view is not a and a not in others else [])])
@@ -176,7 +179,8 @@ def _grow(
         adjust(free, constant, store, K, settings.objective, settings.solver, max_error)
         local_map.remember(view)
         neighbour = view
-    report = adjust(waiting[1:], waiting[:1], store, K, settings.objective, solver, max_error)
+    first, *rest = sorted(done, key=lambda view: view.position)
+    report = adjust(rest, [first], store, K, settings.objective, solver, max_error)
     if not report.mean_error <= start.max_mean_error:
         return Refusal("the first views do not fit together", costly=True)
     return None
