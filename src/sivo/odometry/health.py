@@ -22,6 +22,9 @@ from sivo.tracking.matching import match_units
 from sivo.types import Float64
 
 
+_FEATURES = 600  # the strongest of each view; all of them would only cost time
+
+
 @dataclass(frozen=True)
 class Agreement:
     """Matches of two views that fit the map's relative pose, against those that fit their own essential matrix."""
@@ -77,7 +80,7 @@ def agreement(
     """Match two views with poses afresh, and count."""
     assert a.cam_from_world is not None
     assert b.cam_from_world is not None
-    matches = match_units(a.descriptors, b.descriptors, descriptor_distance)
+    matches = match_units(a.descriptors[:_FEATURES], b.descriptors[:_FEATURES], descriptor_distance)
     if len(matches) < 8:
         return Agreement(0, 0, len(matches))
     pixels_a, pixels_b = a.keypoints[matches[:, 0]], b.keypoints[matches[:, 1]]

@@ -6,6 +6,7 @@ become (2b - 1) / sqrt(number of bits), for which the squared distance is 4 x (s
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 
 from sivo.types import Features, Float32, Int64
@@ -48,11 +49,32 @@ def match_units(a: Float32, b: Float32, max_distance: float | None = None) -> In
     """As `mutual_nearest_neighbours`, on unit vectors (N, D) and (M, D), without scaling the threshold."""
     if len(a) == 0 or len(b) == 0:
         return np.zeros((0, 2), np.int64)
-    similarity = a @ b.T
-    nearest_in_b = similarity.argmax(axis=1)
-    nearest_in_a = similarity.argmax(axis=0)
+    nearest_in_b, nearest_in_a, best = _nearest_both_ways(a @ b.T)
     rows = np.flatnonzero(nearest_in_a[nearest_in_b] == np.arange(len(a)))
     if max_distance is not None:
         # ||x - y||^2 = 2 - 2 x.y for unit vectors
-        rows = rows[2.0 - 2.0 * similarity[rows, nearest_in_b[rows]] <= max_distance**2]
-    return np.stack([rows, nearest_in_b[rows]], axis=1).astype(np.int64)
+        rows = rows[2.0 - 2.0 * best[rows] <= max_distance**2]
+    return np.stack([rows, nearest_in_b[rows]], axis=1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest_both_ways(similarity):  # type: ignore[no-untyped-def]
+    """Largest entry of each row and of each column in one pass (the first of equals), and the rows' largest values.
+
+    NumPy's argmax over columns alone costs as much as the product of the matrices.
+    """
+    rows, columns = similarity.shape
+    best_column = np.zeros(rows, np.int64)
+    best_row = np.zeros(columns, np.int64)
+    row_best = np.full(rows, np.float32(-np.inf))
+    column_best = np.full(columns, np.float32(-np.inf))
+    for i in range(rows):
+        for j in range(columns):
+            value = similarity[i, j]
+            if value > row_best[i]:
+                row_best[i] = value
+                best_column[i] = j
+            if value > column_best[j]:
+                column_best[j] = value
+                best_row[j] = i
+    return best_column, best_row, row_best
