@@ -1,0 +1,1 @@
+"""Everything a person looks at: pictures, HTML pages, the live viewer."""

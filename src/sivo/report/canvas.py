@@ -1,0 +1,113 @@
+"""Drawing on video frames with sub-pixel accuracy; colours are RGB, images are RGB (H, W, 3) uint8."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sivo.report.palettes import RGB
+from sivo.types import Float64, UInt8
+
+_SHIFT = 4  # OpenCV's fixed-point digits
+_TARGET_WIDTH = 960  # small frames are enlarged to about this, so that lines and letters are crisp
+_BAR_HEIGHT = 30
+
+
+class Canvas:
+    """A frame, enlarged by a whole number, that is drawn on in the frame's own pixel coordinates.
+
+    Args:
+        image: grey (H, W) or RGB (H, W, 3).
+        brightness: of the picture below what is drawn.
+        width: enlarge up to about this width.
+    """
+
+    def __init__(self, image: UInt8, brightness: float = 0.75, width: int = _TARGET_WIDTH) -> None:
+        import cv2
+
+        self.scale = max(1, round(width / image.shape[1]))
+        rgb = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+        if self.scale > 1:
+            rgb = cv2.resize(rgb, None, fx=self.scale, fy=self.scale, interpolation=cv2.INTER_LINEAR)
+        self.rgb: UInt8 = np.clip(rgb.astype(np.float32) * brightness, 0, 255).astype(np.uint8)
+
+    def _fixed(self, pixels: Float64) -> NDArray[np.int32]:
+        """Fixed-point coordinates in the enlarged image; pixel centres map to pixel centres."""
+        enlarged = (np.asarray(pixels, np.float64) + 0.5) * self.scale - 0.5
+        return np.round(np.clip(enlarged, -1e5, 1e5) * (1 << _SHIFT)).astype(np.int32)
+
+    def segments(self, start: Float64, end: Float64, colours: UInt8, thickness: int = 1) -> None:
+        """Straight lines from `start` (N, 2) to `end` (N, 2) in colours (N, 3)."""
+        import cv2
+
+        for a, b, colour in zip(
+            self._fixed(start).tolist(), self._fixed(end).tolist(), np.asarray(colours).tolist(), strict=True
+        ):
+            cv2.line(self.rgb, a, b, colour, thickness, cv2.LINE_AA, _SHIFT)
+
+    def dots(self, centres: Float64, colours: UInt8, radius: float = 1.5) -> None:
+        """Filled circles at (N, 2) in colours (N, 3); the radius is in pixels of the frame before enlargement."""
+        import cv2
+
+        size = round(radius * max(1.0, self.scale * 0.75) * (1 << _SHIFT))
+        for centre, colour in zip(self._fixed(centres).tolist(), np.asarray(colours).tolist(), strict=True):
+            cv2.circle(self.rgb, centre, size, colour, -1, cv2.LINE_AA, _SHIFT)
+
+    def rings(self, centres: Float64, radii: Float64, colour: RGB, thickness: int = 2) -> None:
+        """Circles at (N, 2) with radii (N,) in pixels of the frame."""
+        import cv2
+
+        for centre, radius in zip(self._fixed(centres).tolist(), np.asarray(radii).tolist(), strict=True):
+            size = round(radius * self.scale * (1 << _SHIFT))
+            cv2.circle(self.rgb, centre, size, colour, thickness, cv2.LINE_AA, _SHIFT)
+
+    def with_caption(self, text: str, ramp: tuple[UInt8, str, str] | None = None) -> UInt8:
+        """The picture with a line of text below, and a colour ramp (N, 3) with its lowest and highest value in words."""
+        return captioned(self.rgb, text, ramp)
+
+
+def captioned(rgb: UInt8, text: str, ramp: tuple[UInt8, str, str] | None = None) -> UInt8:
+    """A picture with a caption bar below; text that does not fit is drawn smaller."""
+    import cv2
+
+    height, width = _BAR_HEIGHT, rgb.shape[1]
+    bar = np.full((height, width, 3), 24, np.uint8)
+    right = width - 8
+    if ramp is not None:
+        colours, low, high = ramp
+        right = _draw_ramp(bar, colours, low, high)
+    font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.5
+    (text_width, _), _ = cv2.getTextSize(text, font, size, 1)
+    size *= min(1.0, max(0.3, (right - 16) / max(text_width, 1)))
+    cv2.putText(bar, text, (8, 20), font, size, (235, 235, 235), 1, cv2.LINE_AA)
+    return np.concatenate([rgb, bar])
+
+
+def _draw_ramp(bar: UInt8, colours: UInt8, low: str, high: str) -> int:
+    """Draws the ramp at the right end of the bar; returns where the room for text ends."""
+    import cv2
+
+    font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.45
+    high_width = cv2.getTextSize(high, font, size, 1)[0][0]
+    low_width = cv2.getTextSize(low, font, size, 1)[0][0]
+    length = 140
+    end = bar.shape[1] - 10 - high_width - 6
+    start = end - length
+    sampled = colours[np.linspace(0, len(colours) - 1, length).astype(int)]
+    bar[8:22, start:end] = sampled[None]
+    cv2.putText(bar, high, (end + 6, 20), font, size, (235, 235, 235), 1, cv2.LINE_AA)
+    cv2.putText(bar, low, (start - low_width - 6, 20), font, size, (235, 235, 235), 1, cv2.LINE_AA)
+    return start - low_width - 16
+
+
+def stacked(pictures: list[UInt8], columns: int) -> UInt8:
+    """Pictures of one size side by side, in rows of `columns`; the rest of the last row stays dark."""
+    height, width = pictures[0].shape[:2]
+    columns = min(columns, len(pictures))
+    rows = -(-len(pictures) // columns)
+    gap = 4
+    sheet = np.full((rows * (height + gap) - gap, columns * (width + gap) - gap, 3), 24, np.uint8)
+    for number, picture in enumerate(pictures):
+        top, left = (number // columns) * (height + gap), (number % columns) * (width + gap)
+        sheet[top : top + height, left : left + width] = picture
+    return sheet
