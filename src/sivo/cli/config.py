@@ -11,7 +11,10 @@ SETTINGS = {  # command -> its settings
     "run": "sivo.odometry.run_settings:RunSettings",
     "evaluate-pose": "sivo.evaluation.settings:PoseCommandSettings",
     "evaluate-trajectory": "sivo.evaluation.settings:TrajectoryCommandSettings",
+    "evaluate-vo": "sivo.evaluation.settings:VoCommandSettings",
     "evaluate-homography": "sivo.evaluation.settings:HomographyCommandSettings",
+    "train-shapes": "sivo.training.settings:ShapesSettings",
+    "train-homographies": "sivo.training.settings:HomographiesSettings",
 }
 
 

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 from sivo.errors import ConfigError
+from sivo.odometry.settings import OdometrySettings
 from sivo.sequences.base import SequenceSettings
 
 ESTIMATORS = ("opencv", "poselib")
@@ -102,6 +103,16 @@ class TrajectoryCommandSettings:
     """Settings of `sivo evaluate trajectory`."""
 
     sequence: SequenceSettings = field(default_factory=SequenceSettings)
+    trajectory: TrajectorySettings = field(default_factory=TrajectorySettings)
+
+
+@dataclass(frozen=True)
+class VoCommandSettings:
+    """Settings of `sivo evaluate vo`: every 10th frame, as the paper makes it difficult."""
+
+    sequence: SequenceSettings = field(default_factory=lambda: SequenceSettings(stride=10))
+    max_keypoints: int = 1000
+    odometry: OdometrySettings = field(default_factory=OdometrySettings)
     trajectory: TrajectorySettings = field(default_factory=TrajectorySettings)
 
 

@@ -88,6 +88,37 @@ def align(truth: Float64, estimate: Float64, alignment: str) -> Similarity:
     return align_points(truth, estimate, with_scale=alignment == "sim3")
 
 
+@dataclass(frozen=True)
+class AlignedSegment:
+    """Poses of one segment that have a true pose at their time, and the scale that carries them onto it."""
+
+    segment: int
+    times: Float64  # (N,) seconds, of the truth
+    truth: Float64  # (N, 4, 4) world_from_cam, metres
+    estimate: Float64  # (N, 4, 4) world_from_cam as estimated, not aligned
+    motion: Similarity | None  # None where it could not be aligned
+    note: str  # why not
+
+    def errors(self) -> tuple[Float64, Float64]:
+        """Distance in metres and angle in degrees (N,) between aligned and true poses."""
+        assert self.motion is not None
+        aligned = self.motion.apply_to_poses(self.estimate)
+        distance = np.linalg.norm(aligned[:, :3, 3] - self.truth[:, :3, 3], axis=1)
+        return distance, rotation_angle_deg(np.swapaxes(self.truth[:, :3, :3], 1, 2) @ aligned[:, :3, :3])
+
+    def summary(self) -> SegmentErrors:
+        """Absolute errors of this segment."""
+        path, seconds = float(path_lengths(self.truth[:, :3, 3])[-1]), float(self.times[-1] - self.times[0])
+        if self.motion is None:
+            return SegmentErrors(self.segment, len(self.times), seconds, path, None, None, None, None, self.note)
+        distance, angle = self.errors()
+        ate = Spread.of(distance)
+        percent = 100.0 * ate.rmse / path if path > 0 else None
+        return SegmentErrors(
+            self.segment, len(self.times), seconds, path, self.motion.scale, ate, percent, Spread.of(angle), ""
+        )
+
+
 def evaluate_trajectory(
     estimate: Trajectory,
     truth: Trajectory,
@@ -107,70 +138,73 @@ def evaluate_trajectory(
     """
     settings = settings or TrajectorySettings()
     clean, unusable = clean_truth(truth)
-    for trajectory, name in ((estimate, names[0]), (clean, names[1])):
-        if not trajectory.valid.any():
-            raise InputError(f"{name}: has no valid pose among {len(trajectory)}; check the file")
-    estimate_rows, truth_rows = np.flatnonzero(estimate.valid), np.flatnonzero(clean.valid)
-    pairs = associate(estimate.times[estimate_rows], clean.times[truth_rows], settings.max_time_difference)
-    if len(pairs) == 0:
-        raise InputError(_no_common_time(estimate, clean, settings.max_time_difference, names))
-    estimate_rows, truth_rows = estimate_rows[pairs[:, 0]], truth_rows[pairs[:, 1]]
-
-    segments: list[SegmentErrors] = []
-    positions, angles, pieces = [], [], []
-    for segment in np.unique(estimate.segment[estimate_rows]):
-        chosen = estimate.segment[estimate_rows] == segment
-        times = clean.times[truth_rows[chosen]]
-        true_poses = clean.world_from_cam[truth_rows[chosen]]
-        poses = estimate.world_from_cam[estimate_rows[chosen]]
-        path = float(path_lengths(true_poses[:, :3, 3])[-1])
-        try:
-            motion = align(true_poses[:, :3, 3], poses[:, :3, 3], settings.alignment)
-        except InputError as error:
-            empty = SegmentErrors(
-                int(segment), len(times), float(times[-1] - times[0]), path, None, None, None, None, str(error)
-            )
-            segments.append(empty)
-            continue
-        aligned = motion.apply_to_poses(poses)
-        distance = np.linalg.norm(aligned[:, :3, 3] - true_poses[:, :3, 3], axis=1)
-        angle = rotation_angle_deg(np.swapaxes(true_poses[:, :3, :3], 1, 2) @ aligned[:, :3, :3])
-        ate = Spread.of(distance)
-        segments.append(
-            SegmentErrors(
-                segment=int(segment),
-                poses=len(times),
-                seconds=float(times[-1] - times[0]),
-                path_m=path,
-                scale=motion.scale,
-                ate_m=ate,
-                ate_percent=100.0 * ate.rmse / path if path > 0 else None,
-                rotation_deg=Spread.of(angle),
-                note="",
-            )
-        )
-        positions.append(distance)
-        angles.append(angle)
-        pieces.append((times, true_poses, poses, motion.scale))
-
-    windows = [(length, "s") for length in settings.time_windows]
-    windows += [(length, "m") for length in settings.distance_windows]
-    windows += [(length, "path") for length in settings.path_fractions]
-    path = sum(s.path_m for s in segments if s.ate_m is not None)
-    ate_all = Spread.of(np.concatenate(positions)) if positions else None
+    pieces = aligned_segments(estimate, clean, settings, names)
+    segments = tuple(piece.summary() for piece in pieces)
+    aligned = [piece for piece in pieces if piece.motion is not None]
+    path = sum(segment.path_m for segment in segments if segment.ate_m is not None)
+    ate = rotation = None
+    if aligned:
+        distances, angles = zip(*(piece.errors() for piece in aligned), strict=True)
+        ate, rotation = Spread.of(np.concatenate(distances)), Spread.of(np.concatenate(angles))
     return TrajectoryErrors(
         alignment=settings.alignment,
         estimate_poses=int(estimate.valid.sum()),
         truth_poses=int(clean.valid.sum()),
-        poses=len(pairs),
+        poses=sum(len(piece.times) for piece in pieces),
         invalid_truth=tuple(float(time) for time in truth.times[unusable]),
         path_m=path,
-        ate_m=ate_all,
-        ate_percent=100.0 * ate_all.rmse / path if ate_all and path > 0 else None,
-        rotation_deg=Spread.of(np.concatenate(angles)) if angles else None,
-        segments=tuple(segments),
-        relative=tuple(relative_errors(length, unit, pieces, settings.window_tolerance) for length, unit in windows),
+        ate_m=ate,
+        ate_percent=100.0 * ate.rmse / path if ate and path > 0 else None,
+        rotation_deg=rotation,
+        segments=segments,
+        relative=errors_over_windows(aligned, settings),
     )
+
+
+def aligned_segments(
+    estimate: Trajectory,
+    truth: Trajectory,
+    settings: TrajectorySettings,
+    names: tuple[str, str] = ("the estimate", "the truth"),
+) -> list[AlignedSegment]:
+    """Associate by time and align every segment of the estimate on its own.
+
+    Args:
+        truth: after `clean_truth`.
+
+    Raises:
+        InputError: no valid pose in one of them, or no common time.
+    """
+    for trajectory, name in ((estimate, names[0]), (truth, names[1])):
+        if not trajectory.valid.any():
+            raise InputError(f"{name}: has no valid pose among {len(trajectory)}; check the file")
+    estimate_rows, truth_rows = np.flatnonzero(estimate.valid), np.flatnonzero(truth.valid)
+    pairs = associate(estimate.times[estimate_rows], truth.times[truth_rows], settings.max_time_difference)
+    if len(pairs) == 0:
+        raise InputError(_no_common_time(estimate, truth, settings.max_time_difference, names))
+    estimate_rows, truth_rows = estimate_rows[pairs[:, 0]], truth_rows[pairs[:, 1]]
+    pieces = []
+    for segment in np.unique(estimate.segment[estimate_rows]):
+        chosen = estimate.segment[estimate_rows] == segment
+        true_poses = truth.world_from_cam[truth_rows[chosen]]
+        poses = estimate.world_from_cam[estimate_rows[chosen]]
+        motion, note = None, ""
+        try:
+            motion = align(true_poses[:, :3, 3], poses[:, :3, 3], settings.alignment)
+        except InputError as error:
+            note = str(error)
+        times = truth.times[truth_rows[chosen]]
+        pieces.append(AlignedSegment(int(segment), times, true_poses, poses, motion, note))
+    return pieces
+
+
+def errors_over_windows(pieces: list[AlignedSegment], settings: TrajectorySettings) -> tuple[RelativeErrors, ...]:
+    """Relative errors over all windows of aligned segments: by time, by distance, by share of their whole path."""
+    windows = [(length, "s") for length in settings.time_windows]
+    windows += [(length, "m") for length in settings.distance_windows]
+    windows += [(length, "path") for length in settings.path_fractions]
+    segments = [(p.times, p.truth, p.estimate, p.motion.scale) for p in pieces if p.motion is not None]
+    return tuple(relative_errors(length, unit, segments, settings.window_tolerance) for length, unit in windows)
 
 
 def _no_common_time(estimate: Trajectory, truth: Trajectory, max_difference: float, names: tuple[str, str]) -> str:

@@ -64,6 +64,30 @@ def trajectory_tables(result: dict[str, Any], name: str) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def vo_tables(results: dict[str, Any]) -> str:
+    """`vo.json` as Markdown: Table 2 over all sequences, and what each sequence gave."""
+    named = {f"{row['frontend']} {row['variant']}".strip(): row for row in results["rows"]}
+    parts = [sub_trajectory_table(named, "s"), sub_trajectory_table(named, "m")]
+    header = ["Sequence, frontend", "frames", "with pose", "segments", "ATE (m)", "ATE (% of path)"]
+    rows = []
+    for row in results["sequence_rows"]:
+        errors = row["errors"]
+        ate = errors["ate_m"] if errors else None
+        figures = [significant(ate["rmse"] if ate else None), significant(errors["ate_percent"] if errors else None)]
+        label = f"{row['sequence']}, {row['frontend']} {row['variant']}".strip()
+        segments = str(len(errors["segments"])) if errors else "0"
+        rows.append([label, str(row["frames"]), str(row["tracked"]), segments, *figures])
+    parts.append(markdown(header, rows))
+    notes = [
+        f"- {row['sequence']}, {row['frontend']}: {row['note']}" for row in results["sequence_rows"] if row["note"]
+    ]
+    notes += [f"- {entry['sequence']} left out: {entry['reason']}" for entry in results["excluded"]]
+    notes += [
+        f"- {row['frontend']} has no stability head: all weights are 1" for row in results["rows"] if not row["variant"]
+    ]
+    return "\n\n".join(part for part in [*parts, "\n".join(notes)] if part) + "\n"
+
+
 def _absolute(result: dict[str, Any]) -> str:
     header = [
         "Absolute trajectory error",
