@@ -6,10 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sivo.report.palettes import RGB
-from sivo.types import Float64, UInt8
+from sivo.types import UInt8
+
+Pixels = NDArray[np.floating]
 
 _SHIFT = 4  # OpenCV's fixed-point digits
-_TARGET_WIDTH = 960  # small frames are enlarged to about this, so that lines and letters are crisp
+_TARGET_WIDTH = 1280  # small frames are enlarged to about this, so that lines and letters are crisp
 _BAR_HEIGHT = 30
 
 
@@ -31,21 +33,26 @@ class Canvas:
             rgb = cv2.resize(rgb, None, fx=self.scale, fy=self.scale, interpolation=cv2.INTER_LINEAR)
         self.rgb: UInt8 = np.clip(rgb.astype(np.float32) * brightness, 0, 255).astype(np.uint8)
 
-    def _fixed(self, pixels: Float64) -> NDArray[np.int32]:
+    def _fixed(self, pixels: Pixels) -> NDArray[np.int32]:
         """Fixed-point coordinates in the enlarged image; pixel centres map to pixel centres."""
         enlarged = (np.asarray(pixels, np.float64) + 0.5) * self.scale - 0.5
         return np.round(np.clip(enlarged, -1e5, 1e5) * (1 << _SHIFT)).astype(np.int32)
 
-    def segments(self, start: Float64, end: Float64, colours: UInt8, thickness: int = 1) -> None:
+    def segments(self, start: Pixels, end: Pixels, colours: UInt8, thickness: int = 1, opacity: float = 1.0) -> None:
         """Straight lines from `start` (N, 2) to `end` (N, 2) in colours (N, 3)."""
         import cv2
 
+        if opacity < 1.0:
+            below = self.rgb.copy()
+            self.segments(start, end, colours, thickness)
+            self.rgb = cv2.addWeighted(self.rgb, opacity, below, 1.0 - opacity, 0.0)
+            return
         for a, b, colour in zip(
             self._fixed(start).tolist(), self._fixed(end).tolist(), np.asarray(colours).tolist(), strict=True
         ):
             cv2.line(self.rgb, a, b, colour, thickness, cv2.LINE_AA, _SHIFT)
 
-    def dots(self, centres: Float64, colours: UInt8, radius: float = 1.5) -> None:
+    def dots(self, centres: Pixels, colours: UInt8, radius: float = 1.5) -> None:
         """Filled circles at (N, 2) in colours (N, 3); the radius is in pixels of the frame before enlargement."""
         import cv2
 
@@ -53,7 +60,7 @@ class Canvas:
         for centre, colour in zip(self._fixed(centres).tolist(), np.asarray(colours).tolist(), strict=True):
             cv2.circle(self.rgb, centre, size, colour, -1, cv2.LINE_AA, _SHIFT)
 
-    def rings(self, centres: Float64, radii: Float64, colour: RGB, thickness: int = 2) -> None:
+    def rings(self, centres: Pixels, radii: Pixels, colour: RGB, thickness: int = 2) -> None:
         """Circles at (N, 2) with radii (N,) in pixels of the frame."""
         import cv2
 
@@ -62,7 +69,7 @@ class Canvas:
             cv2.circle(self.rgb, centre, size, colour, thickness, cv2.LINE_AA, _SHIFT)
 
     def with_caption(self, text: str, ramp: tuple[UInt8, str, str] | None = None) -> UInt8:
-        """The picture with a line of text below, and a colour ramp (N, 3) with its lowest and highest value in words."""
+        """The picture with a line of text below, and a colour ramp (N, 3) with its two ends in words."""
         return captioned(self.rgb, text, ramp)
 
 

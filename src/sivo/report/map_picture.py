@@ -43,7 +43,16 @@ def draw_map(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"], l
     axis.set_facecolor(_BACKGROUND)
     inside = ((points_2d > low) & (points_2d < high)).all(axis=1)
     size, alpha = _point_style(int(inside.sum()))
-    axis.scatter(*points_2d[inside].T, s=size, c="white", alpha=alpha, linewidths=0, zorder=1, rasterized=True)
+    axis.scatter(
+        points_2d[inside, 0],
+        points_2d[inside, 1],
+        s=size,
+        c="white",
+        alpha=alpha,
+        linewidths=0,
+        zorder=1,
+        rasterized=True,
+    )
 
     links = np.stack([path_2d[:-1], path_2d[1:]], axis=1)
     joined = trajectory.segment[:-1] == trajectory.segment[1:]

@@ -30,7 +30,7 @@ class Palette:
     keypoint: RGB
     flow: RGB
 
-    def ramp_colours(self, values: NDArray[np.floating], low: float, high: float) -> UInt8:
+    def ramp_colours(self, values: NDArray[np.number], low: float, high: float) -> UInt8:
         """(N, 3) RGB of values between `low` and `high`; values beyond take the colour of the end."""
         share = np.clip((np.asarray(values, np.float64) - low) / max(high - low, 1e-12), 0.0, 1.0)
         return (self.colormap()(share)[..., :3] * 255 + 0.5).astype(np.uint8)

@@ -38,8 +38,6 @@ def write_video(path: Path, pictures: Iterable[UInt8], fps: float) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    import cv2
-
     pictures = iter(pictures)
     first = next(pictures)
     height, width = (side - side % 2 for side in first.shape[:2])  # codecs want even sides

@@ -11,7 +11,9 @@ from sivo.labeling.stability import IGNORE, STABLE, UNSTABLE
 from sivo.report.canvas import Canvas
 from sivo.report.palettes import PALETTES, Palette
 from sivo.report.run_folder import RunFolder
-from sivo.types import Int64, UInt8
+from sivo.types import Float32, Int64, UInt8
+
+_JUMP_SHARE = 0.03  # of the image width; shorter links are never called a jump
 
 FramePainter = Callable[[RunFolder, int], UInt8]  # (run, position) -> RGB picture
 
@@ -25,7 +27,7 @@ class TrackPictureSettings:
     old: int = 30  # frames; tracks of this age and more have the last colour
     large_error: float = 3.0  # pixels; residuals of this size and more have the last colour
     palette: Palette = PALETTES["paper"]
-    width: int = 960  # small frames are enlarged to about this
+    width: int = 1280  # small frames are enlarged to about this
 
 
 def paint_tracks(run: RunFolder, position: int, settings: TrackPictureSettings | None = None) -> UInt8:
@@ -42,7 +44,7 @@ def paint_tracks(run: RunFolder, position: int, settings: TrackPictureSettings |
     median = np.median(seen.age[grown]) if len(grown) else 0
     return canvas.with_caption(
         f"frame {position}: {len(grown)} tracks of {settings.min_age}+ frames with their last {settings.tail} frames "
-        f"of flow, {len(young)} younger (dots); median age {median:.0f}",
+        f"of flow, {len(young)} younger (dots); median age {median:.0f}; jumps are faint",
         (settings.palette.ramp_strip(), "new", f"{settings.old}+ frames"),
     )
 
@@ -83,13 +85,24 @@ def paint_labels(run: RunFolder, position: int, settings: TrackPictureSettings |
 
 
 def _draw_tails(canvas: Canvas, run: RunFolder, position: int, tail: int, tracks: Int64, colours: UInt8) -> None:
-    """The flow of the given tracks through the last `tail` frames."""
+    """The flow of the given tracks through the last `tail` frames; links that jump are drawn faintly.
+
+    The tracks are raw: a link to something else stays in them, and would otherwise be all that one sees.
+    """
+    links: list[tuple[Float32, Float32, UInt8]] = []
+    keypoints = run.tracks.keypoints
     later = run.rows_of(position, tracks)
     for frame in range(position - 1, max(position - tail, 0) - 1, -1):
         earlier = run.rows_of(frame, tracks)
         both = (later >= 0) & (earlier >= 0)
         if not both.any():
             break
-        keypoints = run.tracks.keypoints
-        canvas.segments(keypoints[earlier[both]], keypoints[later[both]], colours[both])
+        links.append((keypoints[earlier[both]], keypoints[later[both]], colours[both]))
         later = earlier
+    if not links:
+        return
+    start, end, colour = (np.concatenate(parts) for parts in zip(*links, strict=True))
+    length = np.linalg.norm(end - start, axis=1)
+    jumps = length > max(4.0 * float(np.median(length)), _JUMP_SHARE * run.camera.width)
+    canvas.segments(start[jumps], end[jumps], colour[jumps], opacity=0.25)
+    canvas.segments(start[~jumps], end[~jumps], colour[~jumps], thickness=max(1, canvas.scale - 1))
