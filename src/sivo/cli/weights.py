@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     calibrating.add_argument("images", type=Path, nargs="+", metavar="IMAGES", help="folders or files of pictures")
     calibrating.add_argument("-o", "--output", type=Path, required=True, help="file to write")
     calibrating.add_argument("--count", type=int, default=64, help="pictures to use, spread evenly")
-    calibrating.add_argument("--quantile", type=float, default=1.0, help="of each picture's activations to keep")
+    calibrating.add_argument("--quantile", type=float, default=0.9999, help="of each picture's activations to keep")
     calibrating.set_defaults(action_function=_calibrate)
 
     showing = action("show", "print the model card of a weights file")

@@ -10,13 +10,13 @@ from sivo.frontend.network import Image, prepare
 from sivo.frontend.weights import Weights
 
 
-def calibrate(weights: Weights, images: Iterable[Image], quantile: float = 1.0) -> Weights:
+def calibrate(weights: Weights, images: Iterable[Image], quantile: float = 0.9999) -> Weights:
     """The weights with the largest activations over `images` in their card; the tensors stay as they are.
 
     Args:
         weights: without batch norm after the ReLU.
         images: a few dozen that look like what the network will see; of any size.
-        quantile: of each image's activations; below 1 clips the rarest, for finer steps.
+        quantile: of each image's activations; clipping the rarest leaves finer steps to the others.
 
     Raises:
         InputError: no images, or weights that int8 cannot run.

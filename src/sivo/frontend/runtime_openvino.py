@@ -15,7 +15,7 @@ from sivo.types import Float32
 
 INT8_MAX = 127
 INT8_IMAGE_COPIES = 4
-INT8_LAST_LAYERS: tuple[str, ...] = ()  # of the 1×1 convolutions
+INT8_LAST_LAYERS = ("descriptor.1",)  # of the 1×1 convolutions; rounding the detector's moves keypoints
 
 
 class OpenVinoRuntime:
@@ -23,8 +23,8 @@ class OpenVinoRuntime:
 
     Args:
         weights: of any architecture.
-        int8: compute the 3×3 convolutions in eight bits, by the activation ranges of the model card. The last 1×1 of
-            each head, whose rounding would move scores most, stays in float32.
+        int8: compute all but the detector's and the stability head's last layer in eight bits, by the activation
+            ranges of the model card.
         threads: 0 for as many as the machine has.
 
     One graph is compiled for each image size and kept. Not to be called from several threads at once.
