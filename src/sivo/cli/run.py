@@ -83,7 +83,7 @@ def _track(sequence: Sequence, folder: Path, settings: RunSettings) -> RunSummar
 
     compile_kernels(lambda words: print(words, file=sys.stderr))
     lost = 0
-    with tqdm(total=len(sequence), unit="frame", desc="run", smoothing=0.1) as bar:
+    with tqdm(total=len(sequence), unit="frame", desc="run", smoothing=0.1, delay=0.5) as bar:
 
         def progress(view: object) -> None:
             nonlocal lost
