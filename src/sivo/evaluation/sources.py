@@ -13,7 +13,7 @@ from typing import Any, Protocol
 from sivo.errors import InputError
 from sivo.frontend import Frontend
 from sivo.sequences import Sequence, SequenceSettings
-from sivo.types import Features, Frame
+from sivo.types import Features, Frame, UInt8
 
 PEERS = ("xfeat", "aliked", "disk")
 
@@ -102,7 +102,11 @@ class LoadedFrontend:
         Raises:
             MissingExtraError, ConfigError, InputError: the frontend cannot be loaded.
         """
-        return best(_load(self.name, self.max_keypoints, self.options)(frame.image), self.max_keypoints)
+        return self.of_image(frame.image)
+
+    def of_image(self, image: UInt8) -> Features:
+        """As `features`, of an image (H, W) that is no part of a sequence."""
+        return best(_load(self.name, self.max_keypoints, self.options)(image), self.max_keypoints)
 
     def check(self) -> None:
         """Load the frontend now, so that a wrong name fails before any work."""

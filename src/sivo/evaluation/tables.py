@@ -157,3 +157,20 @@ def _matching(results: dict[str, Any]) -> str:
             values = [_cell(rows, frontend, solver, gap, "inliers") for frontend in frontends]
             columns.append([decimals(value, 0) for value in values])
     return markdown(header, columns_to_rows(frontends, columns))
+
+
+def homography_table(results: dict[str, Any]) -> str:
+    """`homography.json` as Markdown, one table per split."""
+    limits = [f"homography_{limit:g}px" for limit in results["settings"]["corner_errors_px"]]
+    parts = []
+    for split in dict.fromkeys(row["split"] for row in results["rows"]):
+        rows = [row for row in results["rows"] if row["split"] == split]
+        header = [f"{split}: {rows[0]['pairs']} pairs", "repeatab.", "localis. (px)", "mAP", "matching"]
+        header += [f"< {limit:g} px" for limit in results["settings"]["corner_errors_px"]]
+        columns = []
+        for field in ("repeatability", "localisation_error", "mean_average_precision", "matching_score", *limits):
+            values = [row[field] for row in rows]
+            cells = [decimals(value) for value in values]
+            columns.append(bold_best(cells, values, largest=field != "localisation_error"))
+        parts.append(markdown(header, columns_to_rows([row["frontend"] for row in rows], columns)))
+    return "\n\n".join(parts) + "\n"
