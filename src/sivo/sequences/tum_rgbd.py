@@ -126,12 +126,19 @@ class TumRgbdWriter:
         folder: made if it does not exist.
         camera: of the images, written to `camera.yaml` with its distortion.
         depth_scale: depth value of one metre; 5000 is the data set's own, reaching 13 m.
+        jpeg_quality: write the images as JPEG of this quality (0 to 100) instead of PNG.
     """
 
     def __init__(
-        self, folder: Path, camera: Camera, fps: float | None = None, depth_scale: float = DEPTH_SCALE
+        self,
+        folder: Path,
+        camera: Camera,
+        fps: float | None = None,
+        depth_scale: float = DEPTH_SCALE,
+        jpeg_quality: int | None = None,
     ) -> None:
         self.folder = folder
+        self._jpeg_quality = jpeg_quality
         self.camera = camera
         self._scale = depth_scale
         self._images: list[str] = []
@@ -176,14 +183,15 @@ class TumRgbdWriter:
         if not time > self._last_time:
             raise ValueError(f"frame {len(self)}: time {time} does not increase")
         name = f"{len(self):06d}.png"
-        _write_png(self.folder / "rgb" / name, image)
+        picture = name if self._jpeg_quality is None else f"{len(self):06d}.jpg"
+        _write_image(self.folder / "rgb" / picture, image, self._jpeg_quality)
         if depth is not None:
             (self.folder / "depth").mkdir(exist_ok=True)
-            _write_png(self.folder / "depth" / name, depth_values(depth, self._scale))
+            _write_image(self.folder / "depth" / name, depth_values(depth, self._scale))
             self._depth.append(f"{time:.9f} depth/{name}\n")
         if world_from_cam is not None:
             self._truth.append(tum_row(time, world_from_cam))
-        self._images.append(f"{time:.9f} rgb/{name}\n")
+        self._images.append(f"{time:.9f} rgb/{picture}\n")
         self._last_time = time
 
     def close(self) -> None:
@@ -202,9 +210,10 @@ def depth_values(depth: Float32, scale: float) -> np.ndarray:
     return np.where((values > 0) & (values < 65535), values, 0).astype(np.uint16)
 
 
-def _write_png(path: Path, image: np.ndarray) -> None:
+def _write_image(path: Path, image: np.ndarray, jpeg_quality: int | None = None) -> None:
+    options = [] if jpeg_quality is None else [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]
     with written_atomically(path) as temporary:
-        encoded, data = cv2.imencode(".png", image)
+        encoded, data = cv2.imencode(path.suffix, image, options)
         if not encoded:
             raise OutputError(f"{path}: the image cannot be encoded")
         temporary.write_bytes(data.tobytes())
