@@ -59,7 +59,7 @@ class System(NamedTuple):
     point_gradient: Float64  # (M, 3)
     point_root: Float64  # (M, 6) the inverse Cholesky factor of each damped point block
     point_rhs: Float64  # (M, 3) that factor times the gradient
-    elimination: Float64  # (3, 8 O) each coupling block times the transpose of that factor, one row per column of it
+    elimination: Float64  # (3, 8 L) of the present point: its coupling blocks times the transpose of that factor
     reduced: Float64  # flat (F, chunks, 6, STRIDE): the blocks on and above the diagonal, then their Cholesky factor
     camera_step: Float64  # (F, 6) translation, rotation
     point_step: Float64  # (M, 3)
@@ -97,10 +97,14 @@ def arrange(problem: BundleProblem, objective: ObjectiveSettings) -> tuple[Const
         problem.free_points,
         camera_of_free,
     )
-    return constants, observations, _allocate(len(order), len(problem.points), free)
+    return (
+        constants,
+        observations,
+        _allocate(len(order), len(problem.points), free, int((first_constant - first[:-1]).max(initial=0))),
+    )
 
 
-def _allocate(observations: int, points: int, free: int) -> System:
+def _allocate(observations: int, points: int, free: int, longest: int) -> System:
     return System(
         in_camera=np.zeros((observations, 3)),
         coupling=np.zeros((observations, 3, 3)),
@@ -110,11 +114,18 @@ def _allocate(observations: int, points: int, free: int) -> System:
         point_gradient=np.zeros((points, 3)),
         point_root=np.zeros((points, 6)),
         point_rhs=np.zeros((points, 3)),
-        elimination=np.zeros((3, COLUMN * observations)),
-        reduced=np.zeros(free * -(-free // CHUNK) * POSE * STRIDE),
+        elimination=_aligned(3 * COLUMN * longest).reshape(3, -1),
+        reduced=_aligned(free * -(-free // CHUNK) * POSE * STRIDE),
         camera_step=np.zeros((free, POSE)),
         point_step=np.zeros((points, 3)),
     )
+
+
+def _aligned(count: int) -> Float64:
+    """Zeros that start on a cache line, which whole vector registers are read from fastest."""
+    memory = np.zeros(count + 8)
+    start = -(memory.ctypes.data // 8) % 8
+    return memory[start : start + count]
 
 
 @compiled

@@ -3,7 +3,7 @@
 With V = L L^T the damped block of a point and W its coupling with a camera, Y = W L^-T gives all that is needed:
 
     reduced system    S = U - sum Y Y^T,     right side  -(g_c - sum Y L^-1 g_p)
-    back-substitution dX = -L^-T (L^-1 g_p + sum Y^T dc)
+    back-substitution dX = -V^-1 (g_p + sum W^T dc)
 """
 # mypy: disable-error-code="no-untyped-def,no-untyped-call"
 
@@ -18,8 +18,9 @@ from sivo.backend.compiled import compiled
 @compiled
 def eliminate(observations, system, damping, min_diagonal):
     """Fill the reduced system and its right side (in `camera_step`); False where a block is not positive definite."""
+    cameras = len(observations.camera_of_free)
     system.reduced[:] = 0.0
-    for camera in range(len(observations.camera_of_free)):
+    for camera in range(cameras):
         _start_block(system, camera, damping, min_diagonal)
     for j in observations.point_order:
         if not observations.point_is_free[j]:
@@ -28,27 +29,22 @@ def eliminate(observations, system, damping, min_diagonal):
             return False
         first, last = observations.first[j], observations.first_constant[j]
         for a in range(first, last):
-            _couple(observations, system, j, a)
+            _couple(observations, system, j, a, a - first)
         for a in range(first, last):
             start = observations.first_of_camera[a]
             while start < last:
                 end = observations.run_end[start]
-                _subtract_products(observations, system, a, start, end)
+                row = block_start(cameras, observations.free_camera[a], observations.free_camera[start])
+                columns, left = slice(COLUMN * (start - first), COLUMN * (end - first)), COLUMN * (a - first)
+                subtract_rank_3(
+                    system.reduced[row:],
+                    system.elimination[:, left : left + POSE],
+                    system.elimination[0, columns],
+                    system.elimination[1, columns],
+                    system.elimination[2, columns],
+                )
                 start = end
     return True
-
-
-@compiled
-def _subtract_products(observations, system, a, start, end):
-    """S -= Y_a Y_b^T for the observations b of one run, whose columns lie side by side in S as in `elimination`."""
-    row = block_start(len(observations.camera_of_free), observations.free_camera[a], observations.free_camera[start])
-    subtract_rank_3(
-        system.reduced[row:],
-        system.elimination[:, COLUMN * a : COLUMN * a + POSE],
-        system.elimination[0, COLUMN * start : COLUMN * end],
-        system.elimination[1, COLUMN * start : COLUMN * end],
-        system.elimination[2, COLUMN * start : COLUMN * end],
-    )
 
 
 @compiled
@@ -116,8 +112,8 @@ def _invert_root(system, j, damping, min_diagonal):
 
 
 @compiled
-def _couple(observations, system, j, o):
-    """Y = (I; [x]) A R L^-T of one observation, by columns, and its part of the right side."""
+def _couple(observations, system, j, o, slot):
+    """Y = (I; [x]) A R L^-T of one observation, transposed, in its slot; and its part of the right side."""
     x, y, z = system.in_camera[o, 0], system.in_camera[o, 1], system.in_camera[o, 2]
     root, coupling, rhs = system.point_root[j], system.coupling[o], system.point_rhs[j]
     step = system.camera_step[observations.free_camera[o]]
@@ -133,7 +129,7 @@ def _couple(observations, system, j, o):
             m1 = coupling[1, 0] * root[3] + coupling[1, 1] * root[4] + coupling[1, 2] * root[5]
             m2 = coupling[2, 0] * root[3] + coupling[2, 1] * root[4] + coupling[2, 2] * root[5]
         m3, m4, m5 = y * m2 - z * m1, z * m0 - x * m2, x * m1 - y * m0
-        column = system.elimination[k, COLUMN * o : COLUMN * o + POSE]
+        column = system.elimination[k, COLUMN * slot : COLUMN * slot + POSE]
         column[0], column[1], column[2], column[3], column[4], column[5] = m0, m1, m2, m3, m4, m5
         step[0] += m0 * rhs[k]
         step[1] += m1 * rhs[k]
@@ -145,21 +141,24 @@ def _couple(observations, system, j, o):
 
 @compiled
 def back_substitute(observations, system):
-    """The step of every free point from the step of the cameras."""
+    """The step of every free point from the step of the cameras, by how far those move it in each of them."""
     for j in range(len(observations.point_is_free)):
         step = system.point_step[j]
         if not observations.point_is_free[j]:
             step[0] = step[1] = step[2] = 0.0
             continue
-        s0, s1, s2 = system.point_rhs[j, 0], system.point_rhs[j, 1], system.point_rhs[j, 2]
+        g0, g1, g2 = system.point_gradient[j, 0], system.point_gradient[j, 1], system.point_gradient[j, 2]
         for o in range(observations.first[j], observations.first_constant[j]):
-            columns = system.elimination[:, COLUMN * o : COLUMN * o + POSE]
-            camera_step = system.camera_step[observations.free_camera[o]]
-            for i in range(6):
-                s0 += columns[0, i] * camera_step[i]
-                s1 += columns[1, i] * camera_step[i]
-                s2 += columns[2, i] * camera_step[i]
+            x, y, z = system.in_camera[o, 0], system.in_camera[o, 1], system.in_camera[o, 2]
+            camera_step, coupling = system.camera_step[observations.free_camera[o]], system.coupling[o]
+            d0 = camera_step[0] + camera_step[4] * z - camera_step[5] * y
+            d1 = camera_step[1] + camera_step[5] * x - camera_step[3] * z
+            d2 = camera_step[2] + camera_step[3] * y - camera_step[4] * x
+            g0 += coupling[0, 0] * d0 + coupling[1, 0] * d1 + coupling[2, 0] * d2
+            g1 += coupling[0, 1] * d0 + coupling[1, 1] * d1 + coupling[2, 1] * d2
+            g2 += coupling[0, 2] * d0 + coupling[1, 2] * d1 + coupling[2, 2] * d2
         root = system.point_root[j]
+        s0, s1, s2 = root[0] * g0, root[1] * g0 + root[2] * g1, root[3] * g0 + root[4] * g1 + root[5] * g2
         step[0] = -(root[0] * s0 + root[1] * s1 + root[3] * s2)
         step[1] = -(root[2] * s1 + root[4] * s2)
         step[2] = -(root[5] * s2)

@@ -31,7 +31,7 @@ def solve(
     """Minimise Omega (see `sivo.backend.objective`) over the free poses and points.
 
     Args:
-        timed: fill `BundleResult.seconds` with the time of each of PARTS.
+        timed: fill `BundleResult.seconds` with the processor time of each of PARTS.
 
     Returns:
         The best state seen; its cost is never above the initial one, and never NaN.
@@ -81,6 +81,7 @@ def solve(
             rejected += 1
             damping, growth = damping * growth, growth * 2.0
 
+    converged = converged or damping > settings.max_damping
     errors, depths = errors_and_depths(constants, observations, poses, points)
     return BundleResult(
         poses, points, errors, depths, float(cost), float(initial_cost), iterations, rejected, converged, clock.seconds
@@ -88,7 +89,7 @@ def solve(
 
 
 class _Stopwatch:
-    """Seconds per part; does nothing unless asked."""
+    """Processor seconds of this thread per part, which a busy machine disturbs less; does nothing unless asked."""
 
     def __init__(self, running: bool) -> None:
         self.running = running
@@ -100,8 +101,8 @@ class _Stopwatch:
 
     def __enter__(self) -> None:
         if self.running:
-            self.start = time.perf_counter()
+            self.start = time.thread_time()
 
     def __exit__(self, *_: Any) -> None:
         if self.running:
-            self.seconds[self.part] += time.perf_counter() - self.start
+            self.seconds[self.part] += time.thread_time() - self.start
