@@ -1,4 +1,4 @@
-"""`sivo show PICTURE OUT`: the paper's pictures of a finished run."""
+"""`sivo show PICTURE ...`: the paper's pictures, of a finished run, a recording or an evaluation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sivo.errors import ConfigError, OutputError
+from sivo.cli.options import add_config_arguments, add_sequence_arguments
+from sivo.errors import InputError
 
 if TYPE_CHECKING:
     from sivo.report.run_folder import RunFolder
@@ -18,6 +19,7 @@ _FRAME_PICTURES = {
     "residuals": "re-projection errors over the image, blue low to red high",
     "labels": "stable, unstable and ignored points over the image",
 }
+_EVENLY = "6"  # frames of a sheet
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,14 +30,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for name, help_line in _FRAME_PICTURES.items():
         frames = _picture(pictures, name, help_line, show_frames)
         frames.add_argument(
-            "--frames", default="6", metavar="WHICH", help="`all`, a list such as 10,50,90, or N for N spread evenly"
-        )
-        frames.add_argument("--each", action="store_true", help="one PNG per frame, not one sheet")
-        frames.add_argument("--video", action="store_true", help="one MP4 (of all frames, unless --frames says else)")
-        frames.add_argument("--fps", type=float, help="of the video (default: as recorded)")
-        frames.add_argument(
             "--sequence", type=Path, metavar="PATH", help="where the recording is now (default: where it was)"
         )
+        _add_frames(frames)
+    _add_recording_pictures(pictures)
+    accuracy = _picture(pictures, "accuracy", "pose accuracy against threshold, of several frontends", show_accuracy)
+    accuracy.add_argument("--estimator", help="only this solver (default: one picture for each)")
+
+
+def _add_recording_pictures(pictures: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The pictures that need a recording and frontends, not a run."""
+    stability = _picture(pictures, "stability", "dense stability over the image", show_stability, of_run=False)
+    stability.add_argument("--frontend", metavar="NAME", help="network with a stability head (default: the run's)")
+    _add_frames(stability)
+    matches = _picture(pictures, "matches", "two frontends on one image pair", show_matches, of_run=False)
+    matches.add_argument("--frontends", default="superpoint-vo,sift", metavar="A,B", help="one row of panels each")
+    matches.add_argument("--pair", default="0,30", metavar="A,B", help="the two frames")
+    matches.add_argument("--max-keypoints", type=int, default=500, metavar="N", help="per frame")
+    for parser in (stability, matches):
+        add_sequence_arguments(parser)
+        add_config_arguments(parser)
 
 
 def _picture(
@@ -43,17 +57,32 @@ def _picture(
     name: str,
     help_line: str,
     function: Callable[[argparse.Namespace], None],
+    of_run: bool = True,
 ) -> argparse.ArgumentParser:
     parser = pictures.add_parser(
         name, help=help_line, description=help_line, formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
-    parser.add_argument("folder", type=Path, metavar="OUT", help="output folder of `sivo run`")
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="PATH", help=f"file or folder (default: OUT/pictures/{name}.png)"
-    )
-    parser.add_argument("--palette", choices=("paper", "colour-blind"), default="paper", help="of the picture")
+    if of_run:
+        made_by = "sivo evaluate pose" if name == "accuracy" else "sivo run"
+        parser.add_argument("folder", type=Path, metavar="OUT", help=f"output folder of `{made_by}`")
+        default = f"OUT/pictures/{name}.png"
+    else:
+        parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a recording, or the folder of a run")
+        default = f"./{name}.png"
+    parser.add_argument("-o", "--output", type=Path, metavar="PATH", help=f"file or folder (default: {default})")
+    if name != "accuracy":
+        parser.add_argument("--palette", choices=("paper", "colour-blind"), default="paper", help="of the picture")
     parser.set_defaults(show=function)
     return parser
+
+
+def _add_frames(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--frames", default=_EVENLY, metavar="WHICH", help="`all`, a list such as 10,50,90, or N for N spread evenly"
+    )
+    parser.add_argument("--each", action="store_true", help="one PNG per frame, not one sheet")
+    parser.add_argument("--video", action="store_true", help="one MP4 (of all frames, unless --frames says else)")
+    parser.add_argument("--video-fps", type=float, metavar="FPS", help="of the video (default: as recorded)")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -63,12 +92,13 @@ def run(arguments: argparse.Namespace) -> None:
 
 def show_map(arguments: argparse.Namespace) -> None:
     """`sivo show map`."""
+    from sivo.cli.show_options import target_path
     from sivo.report.map_picture import draw_map
     from sivo.report.palettes import palette
     from sivo.report.run_folder import RunFolder
 
     run_folder = RunFolder(arguments.folder)
-    target = _target(arguments, "map.png")
+    target = target_path(arguments.output, arguments.folder / "pictures", "map.png")
     draw_map(run_folder, target, palette(arguments.palette), arguments.last)
     print(target)
 
@@ -77,6 +107,7 @@ def show_frames(arguments: argparse.Namespace) -> None:
     """`sivo show tracks`, `residuals` and `labels`: a sheet, PNG files or a video."""
     from functools import partial
 
+    from sivo.cli.show_options import chosen_positions, recorded_fps, write_pictures
     from sivo.report import track_pictures
     from sivo.report.palettes import palette
     from sivo.report.run_folder import RunFolder
@@ -87,71 +118,88 @@ def show_frames(arguments: argparse.Namespace) -> None:
         "residuals": partial(track_pictures.paint_residuals, settings=settings),
         "labels": partial(track_pictures.paint_labels, settings=settings),
     }
-    run_folder = RunFolder(arguments.folder, arguments.sequence)
-    _write(arguments, run_folder, painters[arguments.picture])
+    run_folder: RunFolder = RunFolder(arguments.folder, arguments.sequence)
+    painter = painters[arguments.picture]
+    positions = chosen_positions(_which(arguments), run_folder.frames)
+    folder = arguments.folder / "pictures"
+    write_pictures(arguments, folder, positions, lambda p: painter(run_folder, p), recorded_fps(run_folder))
 
 
-def _write(arguments: argparse.Namespace, run_folder: RunFolder, painter: FramePainter) -> None:
-    """The pictures of the chosen frames, in the chosen form."""
-    from tqdm import tqdm
+def show_stability(arguments: argparse.Namespace) -> None:
+    """`sivo show stability`."""
+    from sivo.cli.show_options import chosen_positions, opened_sequence, write_pictures
+    from sivo.frontend.network import NetworkFrontend
+    from sivo.frontend.registry import load_frontend
+    from sivo.report.palettes import palette
+    from sivo.report.stability_picture import paint_stability
 
-    from sivo.report.sheets import write_png, write_sheet, write_video
+    sequence, frontend_of_run = opened_sequence(arguments)
+    name = arguments.frontend or frontend_of_run or "superpoint-vo"
+    frontend = load_frontend(name)
+    if not isinstance(frontend, NetworkFrontend):
+        raise InputError(f"{name}: has no stability head; name a network that has one with --frontend")
+    colours, shown_name = palette(arguments.palette), Path(name).stem
+    positions = chosen_positions(_which(arguments), len(sequence))
+    times = sequence.times
+    fps = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 30.0
+    write_pictures(
+        arguments,
+        Path(),
+        positions,
+        lambda p: paint_stability(sequence[p].image, frontend, f"frame {p}, {shown_name}", colours),
+        fps,
+    )
 
-    chosen = "all" if arguments.video and arguments.frames == "6" else arguments.frames
-    positions = _positions(chosen, run_folder.frames)
-    progress = tqdm(positions, unit="frame", desc=arguments.picture, disable=len(positions) < 20)
-    pictures = (painter(run_folder, position) for position in progress)
-    if arguments.video:
-        target = _target(arguments, f"{arguments.picture}.mp4")
-        write_video(target, pictures, arguments.fps or _recorded_fps(run_folder))
-    elif arguments.each or len(positions) > 60:
-        target = _target(arguments, arguments.picture)
-        target.mkdir(exist_ok=True)
-        for position, picture in zip(positions, pictures, strict=True):
-            write_png(target / f"{arguments.picture}_{position:06d}.png", picture)
-    else:
-        target = _target(arguments, f"{arguments.picture}.png")
-        write_sheet(target, list(pictures))
+
+def show_matches(arguments: argparse.Namespace) -> None:
+    """`sivo show matches`."""
+    import numpy as np
+
+    from sivo.cli.show_options import chosen_positions, opened_sequence, target_path
+    from sivo.frontend.registry import load_frontend
+    from sivo.report.match_picture import paint_matches
+    from sivo.report.palettes import palette
+    from sivo.report.sheets import write_png
+
+    sequence, _ = opened_sequence(arguments)
+    pair = chosen_positions(arguments.pair, len(sequence))
+    if len(pair) != 2 or "," not in arguments.pair:
+        raise InputError(f"--pair {arguments.pair}: give two frames, such as 0,30")
+    image_a, image_b = (sequence[position].image for position in pair)
+    depth_a = sequence.depth(pair[0])
+    rows = [
+        paint_matches(
+            load_frontend(name, arguments.max_keypoints),
+            image_a,
+            image_b,
+            depth_a,
+            sequence.camera,
+            palette(arguments.palette),
+        )
+        for name in arguments.frontends.split(",")
+    ]
+    target = target_path(arguments.output, Path(), "matches.png")
+    write_png(target, np.concatenate(rows))
     print(target)
 
 
-def _positions(which: str, count: int) -> list[int]:
-    """The frames that `--frames` names."""
-    if which == "all":
-        return list(range(count))
-    try:
-        numbers = [int(word) for word in which.split(",")]
-    except ValueError:
-        raise ConfigError(f"--frames {which}: give `all`, a list such as 10,50,90, or a number of frames") from None
-    if "," in which:
-        wrong = [number for number in numbers if not 0 <= number < count]
-        if wrong:
-            raise ConfigError(f"--frames {which}: the run has no frame {wrong[0]}; frames are 0 to {count - 1}")
-        return numbers
-    if numbers[0] < 1:
-        raise ConfigError(f"--frames {which}: must be at least 1")
-    spread = min(numbers[0], count)
-    return [round((i + 0.5) * count / spread - 0.5) for i in range(spread)]  # the middles of equal parts
+def show_accuracy(arguments: argparse.Namespace) -> None:
+    """`sivo show accuracy`."""
+    from sivo.cli.evaluate_pose import read_results
+    from sivo.cli.show_options import target_path
+    from sivo.evaluation.plots import draw_pose_curves
+
+    results = read_results(arguments.folder / "pose.json")
+    known = results["settings"]["estimators"]
+    if arguments.estimator is not None and arguments.estimator not in known:
+        raise InputError(f"--estimator {arguments.estimator}: not in pose.json; it has {', '.join(known)}")
+    for estimator in [arguments.estimator] if arguments.estimator else known:
+        target = target_path(arguments.output, arguments.folder / "pictures", f"accuracy-{estimator}.png")
+        if len(known) > 1 and arguments.estimator is None and target == arguments.output:
+            target = target.with_stem(f"{target.stem}-{estimator}")
+        draw_pose_curves(results, estimator, target)
+        print(target)
 
 
-def _recorded_fps(run_folder: RunFolder) -> float:
-    """Frames per second of the processed sequence."""
-    first, last = (run_folder.report["input"][name] for name in ("first_time", "last_time"))
-    return (run_folder.frames - 1) / (last - first) if first is not None and last > first else 30.0
-
-
-def _target(arguments: argparse.Namespace, name: str) -> Path:
-    """Where to write: `--output` as a file or folder, else OUT/pictures."""
-    output: Path | None = arguments.output
-    if output is None:
-        output = arguments.folder / "pictures"
-    elif output.suffix:
-        folder = output.parent
-        if not folder.is_dir():
-            raise OutputError(f"{output}: no folder {folder}; make it first")
-        return output
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{output}: cannot be made ({error.strerror}); choose another folder") from None
-    return output / name
+def _which(arguments: argparse.Namespace) -> str:
+    return "all" if arguments.video and arguments.frames == _EVENLY else arguments.frames
