@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sivo.errors import ConfigError, InputError
-from sivo.sequences.base import Recording, SequenceSettings
+from sivo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
 from sivo.sequences.live import LiveStream, is_live
 from sivo.sequences.live_sequence import LiveSequence
 from sivo.sequences.sequence import Sequence
@@ -75,6 +75,8 @@ def open_recording(path: Path | str, settings: SequenceSettings | None = None, *
         chosen = _format(settings.format)
     try:
         return chosen(path, settings)
+    except UnreadableFrameError as error:
+        raise InputError(f"{path}: {error}; copy or export the recording again") from None
     except OSError as error:
         raise InputError(
             f"{error.filename or path}: {error.strerror or error}; check the path and permissions"

@@ -8,7 +8,7 @@ the bag gives them all and opening reads no images; otherwise the headers are re
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,9 @@ from sivo.sequences import ros_messages
 from sivo.sequences.association import nearest
 from sivo.sequences.base import Recording, SequenceSettings
 from sivo.sequences.calibration import Calibration
-from sivo.sequences.ros_topics import Stream, candidates, open_reader
+from sivo.sequences.ros_topics import Stream, candidates, deserialized, guarded, open_reader
 from sivo.sequences.trajectory_files import increasing_order
-from sivo.types import Float32, Trajectory, UInt8
+from sivo.types import Float32, Int64, Trajectory, UInt8
 
 _TRUTH_NAME = re.compile(r"ground.?truth|(^|[/_])gt([/_]|$)|vicon|mocap|optitrack|leica", re.IGNORECASE)
 _POSE_TYPES = (
@@ -51,12 +51,28 @@ class RosBag(Recording):
         notes += [f"{path}: {repeated} images repeat a time stamp and were left out"] if repeated else []
         self._rows, self.times = order, stamps[order]
         self.calibration = _camera_info(self._reader, self._images.topic, path)
-        self._depth: Stream | None = None
-        if depths:
-            self._depth, self._depth_rows, more = self._associate_depth(depths)
-            notes += more
-        self.ground_truth, more = _ground_truth(self._reader, path)
-        self.notes = (*notes, *more)
+        self._depths = depths
+        self._notes = notes
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        return tuple(self._notes)
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:  # type: ignore[override]
+        """Read when it is first asked for: a bag has no index of poses."""
+        trajectory, notes = _ground_truth(self._reader, self.path)
+        self._notes += notes
+        return trajectory
+
+    @cached_property
+    def _depth(self) -> tuple[Stream, Int64] | None:
+        """The depth stream and its row for each image, -1 where there is none."""
+        if not self._depths:
+            return None
+        stream, rows, notes = self._associate_depth(self._depths)
+        self._notes += notes
+        return None if stream is None else (stream, rows)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -73,11 +89,12 @@ class RosBag(Recording):
         return ros_messages.image(self._images.message(int(self._rows[index])))
 
     def depth(self, index: int) -> Float32 | None:
-        if self._depth is None or self._depth_rows[index] < 0:
+        if self._depth is None:
             return None
-        return ros_messages.depth(self._depth.message(int(self._depth_rows[index])))
+        stream, rows = self._depth
+        return None if rows[index] < 0 else ros_messages.depth(stream.message(int(rows[index])))
 
-    def _associate_depth(self, depths: list[Stream]) -> tuple[Stream | None, np.ndarray, list[str]]:
+    def _associate_depth(self, depths: list[Stream]) -> tuple[Stream | None, Int64, list[str]]:
         """The depth stream of the images' camera and its row for each image.
 
         Depth of another camera would have to be carried over by a transform that a bag need not hold; it is left out.
@@ -127,14 +144,15 @@ def _camera_info(reader: Any, topic: str, path: Path) -> Calibration | None:
     chosen = beside or (infos[0] if len(infos) == 1 else None)
     if chosen is None:
         return None
-    message = _first_message(reader, chosen)
+    message = _first_message(reader, chosen, path)
     source = f"{path}#{chosen.topic}"
     return None if message is None else ros_messages.calibration(message, source, rectified="image_rect" in topic)
 
 
-def _first_message(reader: Any, connection: Any) -> Any:
-    for _, _, data in reader.messages(connections=[connection]):
-        return reader.deserialize(data, connection.msgtype)
+def _first_message(reader: Any, connection: Any, path: Path) -> Any:
+    """The first message of a connection, None if there is none that can be deserialised."""
+    for _, _, data in guarded(reader.messages(connections=[connection]), path):
+        return deserialized(reader, data, connection.msgtype)
     return None
 
 
@@ -147,18 +165,18 @@ def _ground_truth(reader: Any, path: Path) -> tuple[Trajectory | None, list[str]
     if chosen is None:
         return None, []
     times, matrices = [], []
-    for time, data in _raw(reader, chosen):
-        message = reader.deserialize(data, chosen.msgtype)
-        times.append((ros_messages.header_stamp(data, reader.is2) or time) / 1e9)
-        matrices.append(ros_messages.pose(message))
+    notes = [f"{path}: ground truth from {chosen.topic}, taken as poses of the camera (x right, y down, z forward)"]
+    try:
+        for _, time, data in guarded(reader.messages(connections=[chosen]), path):
+            message = deserialized(reader, data, chosen.msgtype)
+            times.append((ros_messages.header_stamp(data, reader.is2) or time) / 1e9)
+            matrices.append(np.full((4, 4), np.nan) if message is None else ros_messages.pose(message))
+    except InputError as error:
+        notes.append(f"{error} (ground truth ends there)")
+    if not times:
+        return None, notes
     order, _ = increasing_order(np.array(times))
     trajectory = Trajectory(np.array(times)[order], np.stack(matrices)[order])
-    notes = [f"{path}: ground truth from {chosen.topic}, taken as poses of the camera (x right, y down, z forward)"]
     bad = int((~trajectory.valid).sum())
     notes += [f"{path}: {bad} poses of {chosen.topic} are no rigid motion"] if bad else []
     return (trajectory if trajectory.valid.any() else None), notes
-
-
-def _raw(reader: Any, connection: Any) -> Iterator[tuple[int, bytes]]:
-    for _, time, data in reader.messages(connections=[connection]):
-        yield time, data

@@ -99,7 +99,8 @@ class Stream:
         headers = [ros_messages.header_stamp(self._data(int(row)), self._reader.is2) for row in samples]
         if not any(headers) or (np.abs(np.array(headers) - bag_times[samples]) < 1000).all():
             return bag_times / 1e9
-        every = [ros_messages.header_stamp(data, self._reader.is2) for _, _, data in self._messages()]
+        raw = guarded(self._messages(), self._path)
+        every = [ros_messages.header_stamp(data, self._reader.is2) for _, _, data in raw]
         return np.array(every[:count], np.int64) / 1e9
 
     def _data(self, row: int) -> bytes:
@@ -157,6 +158,22 @@ class Stream:
             times += [row[0] for row in database.execute(query, (self.topic,))]
             database.close()
         return times
+
+
+def deserialized(reader: Any, data: bytes, kind: str) -> Any:
+    """The message, None if it is damaged (which rosbags reports with errors of several modules)."""
+    try:
+        return reader.deserialize(data, kind)
+    except Exception:
+        return None
+
+
+def guarded(messages: Iterator[tuple[Any, int, bytes]], path: Path) -> Iterator[tuple[Any, int, bytes]]:
+    """The same messages; damage in the bag, which shows as errors of many kinds, becomes an InputError."""
+    try:
+        yield from messages
+    except Exception as error:
+        raise InputError(f"{path}: is damaged ({_reason(error)}); repair or record it again") from None
 
 
 def _reason(error: Exception) -> str:

@@ -22,10 +22,11 @@ from sivo.sequences.calibration import Calibration
 from sivo.sequences.images import decode, depth_in_metres
 from sivo.sequences.registration import intrinsics_of, register_depth, relative_extrinsics
 from sivo.sequences.trajectory_files import clean_poses
-from sivo.types import Float32, Trajectory, UInt8
+from sivo.types import Float32, Int64, Trajectory, UInt8
 
 FPS = 30.0
 _FRAME = struct.Struct("<16f4Q")  # camera-to-world, colour and depth time, colour and depth bytes
+_BYTES = struct.Struct("<2Q")  # the last two of them
 _SIZES = struct.Struct("<2i4IfQ")  # compressions, colour and depth sizes, depth values per metre, frames
 _COLOUR = {0: "raw", 1: "png", 2: "jpeg"}
 _DEPTH = {0: "raw", 1: "zlib"}
@@ -45,10 +46,10 @@ class ScanNetSens(Recording):
             raise InputError(f"{path}: cannot be opened ({error.strerror}); check the path") from None
         self._length = path.stat().st_size
         claimed = self._read_header()
-        frames, cut = self._hop(claimed)
+        frames, self._offsets, cut = self._hop(claimed)
         if len(frames) == 0:
             raise InputError(f"{path}: holds no complete frame (truncated?); copy it again")
-        self._offsets, self._colour_bytes, self._depth_bytes = frames["offset"], frames["colour"], frames["depth"]
+        self._colour_bytes, self._depth_bytes = frames["colour"], frames["depth"]
         notes = [f"{path}: is cut short: {len(frames)} of {claimed} frames are there"] if cut else []
         self.times = frames["time"] / 1e6
         if settings.fps is not None:
@@ -140,20 +141,23 @@ class ScanNetSens(Recording):
         self._base_from_colour, self._colour_from_depth = relative_extrinsics(extrinsic_colour, extrinsic_depth)
         return int(claimed)
 
-    def _hop(self, claimed: int) -> tuple[np.ndarray, bool]:
-        """One row per complete frame; and whether frames are missing that the header claims."""
-        kind = np.dtype([("pose", "<f4", 16), ("time", "<u8"), ("offset", "<i8"), ("colour", "<i8"), ("depth", "<i8")])
-        rows: list[tuple[list[float], int, int, int, int]] = []
+    def _hop(self, claimed: int) -> tuple[np.ndarray, Int64, bool]:
+        """Header and data offset of each complete frame; and whether frames are missing that the file claims."""
+        headers: list[bytes] = []
+        starts: list[int] = []
         position = self._file.tell()
-        while len(rows) < claimed and position + _FRAME.size <= self._length:
+        while len(headers) < claimed and position + _FRAME.size <= self._length:
             self._file.seek(position)
             header = self._file.read(_FRAME.size)
             if len(header) < _FRAME.size:
                 break
-            *pose, time, _, colour, depth = _FRAME.unpack(header)
             start = position + _FRAME.size
-            if colour > self._length or depth > self._length or start + colour + depth > self._length:
+            colour, depth = _BYTES.unpack_from(header, 80)
+            if start + colour + depth > self._length:
                 break
-            rows.append((pose, time, start, colour, depth))
-            position = start + colour + depth
-        return np.array(rows, kind), len(rows) < claimed
+            headers.append(header)
+            starts.append(start)
+            position = start + int(colour) + int(depth)
+        fields = [("pose", "<f4", 16), ("time", "<u8"), ("depth_time", "<u8"), ("colour", "<i8"), ("depth", "<i8")]
+        frames = np.frombuffer(b"".join(headers), np.dtype(fields))
+        return frames, np.array(starts, np.int64), len(headers) < claimed
