@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -114,3 +115,63 @@ def test_something_else_named_video(tmp_path: Path) -> None:
         (tmp_path / "v.mp4").write_bytes(content)
         with pytest.raises(InputError, match=r"v\.mp4"):
             open_sequence(tmp_path / "v.mp4", fov=60.0)
+
+
+def rotated(data: bytes, degrees: int) -> bytes:
+    """An MP4 whose track header says that it is to be shown turned clockwise (ISO 14496-12, `tkhd` matrix)."""
+    at = data.index(b"tkhd") + 4 + 40  # version 0: 40 bytes before the matrix
+    one = 1 << 16
+    a, b, c, d = {90: (0, one, -one, 0), 180: (-one, 0, 0, -one), 270: (0, -one, one, 0)}[degrees]
+    matrix = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    return data[:at] + matrix + data[at + 36 :]
+
+
+@pytest.mark.parametrize(("degrees", "quarter_turns"), [(90, 3), (180, 2), (270, 1)])
+def test_rotation_metadata_is_applied(tmp_path: Path, degrees: int, quarter_turns: int) -> None:
+    write_video(tmp_path / "v.mp4", images(4), codec="FFV1")
+    (tmp_path / "v.mp4").write_bytes(rotated((tmp_path / "v.mp4").read_bytes(), degrees))
+    sequence = open_sequence(tmp_path / "v.mp4", fov=60.0)
+    for frame, image in zip(sequence, images(4), strict=True):
+        assert (frame.image == np.rot90(image, quarter_turns)).all()
+    assert (sequence.camera.height, sequence.camera.width) == sequence[0].image.shape
+
+
+def with_durations(data: bytes, durations: list[int]) -> bytes:
+    """An MP4 of a constant rate with other sample durations (ISO 14496-12, `stts`): the boxes around it grow."""
+    table = struct.pack(">II", 0, len(durations)) + b"".join(struct.pack(">II", 1, d) for d in durations)
+
+    def rebuilt(box: bytes) -> bytes:
+        kind, body = box[4:8], box[8:]
+        if kind == b"stts":
+            body = table
+        elif kind in (b"moov", b"trak", b"mdia", b"minf", b"stbl"):
+            body = b"".join(rebuilt(child) for child in boxes(body))
+        return struct.pack(">I", 8 + len(body)) + kind + body
+
+    return b"".join(rebuilt(box) for box in boxes(data))
+
+
+def boxes(data: bytes) -> list[bytes]:
+    result = []
+    while data:
+        size = struct.unpack(">I", data[:4])[0]
+        result.append(data[:size])
+        data = data[size:]
+    return result
+
+
+def test_variable_frame_rate_has_its_true_times(tmp_path: Path) -> None:
+    write_video(tmp_path / "v.mp4", images(30), fps=25.0, codec="mp4v")
+    in_order = list(open_sequence(tmp_path / "v.mp4", fov=60.0))
+    data = (tmp_path / "v.mp4").read_bytes()
+    assert data.index(b"mdat") < data.index(b"moov")  # so that growing the index moves no samples
+    at = data.index(b"mdhd") + 4 + 12
+    ticks = struct.unpack(">I", data[at : at + 4])[0]
+    shares = np.random.default_rng(0).uniform(0.1, 1.0, 30)
+    durations = [int(30 / 25 * ticks * share) for share in shares / shares.sum()]  # as long as the edit list says
+    (tmp_path / "vfr.mp4").write_bytes(with_durations(data, durations))
+    sequence = open_sequence(tmp_path / "vfr.mp4", fov=60.0)
+    expected = np.concatenate([[0], np.cumsum(durations[:-1])]) / ticks
+    np.testing.assert_allclose(sequence.times, expected, atol=2e-6)
+    for i in np.random.default_rng(1).permutation(30).tolist():
+        assert (sequence[i].image == in_order[i].image).all(), i
