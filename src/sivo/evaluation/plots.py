@@ -26,7 +26,7 @@ def draw_pose_curves(results: dict[str, Any], estimator: str, path: Path) -> Non
     settings = results["settings"]
     gaps, frontends = settings["gaps"], results["frontends"]
     pose = {entry["gap"]: entry for entry in results["gaps"]}
-    figure = Figure(figsize=(1.2 + 3.3 * len(gaps), 6.2), layout="constrained")
+    figure = Figure(figsize=(1.2 + 3.3 * len(gaps), 7.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, len(gaps), squeeze=False, sharey=True)
     for column, gap in enumerate(gaps):
@@ -52,7 +52,15 @@ def draw_pose_curves(results: dict[str, Any], estimator: str, path: Path) -> Non
             axis.set_ylim(0, 1.02)
             axis.grid(color="0.9")
             axis.set_xlabel(f"{kind} error threshold ({'degrees' if kind == 'rotation' else 'cm'})")
-            axis.legend(fontsize=7, title="area under curve", title_fontsize=7, framealpha=0.8)
+            axis.legend(
+                fontsize=7,
+                title="area under curve",
+                title_fontsize=7,
+                loc="upper center",
+                bbox_to_anchor=(0.5, -0.17),
+                ncol=3,
+                frameon=False,
+            )
         average = pose[gap]
         axes[0, column].set_title(
             f"gap {gap}: {average['mean_rotation_deg']:.0f}°, {100 * average['mean_translation_m']:.0f} cm on average"
