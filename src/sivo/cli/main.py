@@ -17,9 +17,11 @@ from sivo.errors import SivoError
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("run", "visual odometry on one sequence: trajectory, map, tracks"),
     "evaluate": ("evaluate", "how good a frontend or a trajectory is: the paper's protocols"),
+    "train": ("train", "teach the network: drawn shapes, homographies"),
     "show": ("show", "pictures of a finished run"),
     "weights": ("weights", "import public weights, prepare weights for int8, print a model card"),
     "export": ("export", "what other tools read: ONNX"),
+    "simulate": ("simulate", "render rooms with exact depth, poses and causes of instability"),
     "config": ("config", "print all settings of a command as YAML"),
 }
 
