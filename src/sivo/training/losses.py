@@ -1,0 +1,68 @@
+"""The losses of the training stages, in torch."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from sivo.training.labels import IGNORED
+
+
+def detector_loss(logits: Tensor, cells: Tensor) -> Tensor:
+    """Softmax cross-entropy over the 65 classes of a cell; ignored cells count for nothing (paper, "Training Details").
+
+    Args:
+        logits: (B, 65, Hc, Wc).
+        cells: (B, Hc, Wc) int64, 0..64 or `IGNORED`.
+    """
+    total = functional.cross_entropy(logits.float(), cells, ignore_index=IGNORED, reduction="sum")
+    return total / (cells != IGNORED).sum().clamp(min=1)
+
+
+def info_nce_loss(
+    a: Tensor, b: Tensor, points_a: Tensor, points_b: Tensor, valid: Tensor, scale: Tensor, masked_pixels: float
+) -> Tensor:
+    """Symmetric InfoNCE over sparse correspondences: each descriptor must pick its partner among those of its pair.
+
+    Args:
+        a, b: (B, N, D) unit descriptors of corresponding points.
+        points_a, points_b: (B, N, 2) pixels; points nearer than `masked_pixels` in either view are not negatives.
+        valid: (B, N) bool.
+        scale: () inverse temperature.
+    """
+    similarity = scale * torch.einsum("bnd,bmd->bnm", a, b)
+    near = (torch.cdist(points_a, points_a) < masked_pixels) | (torch.cdist(points_b, points_b) < masked_pixels)
+    itself = torch.eye(a.shape[1], dtype=torch.bool, device=a.device)
+    refused = (near & ~itself) | ~valid[:, None, :] | ~valid[:, :, None]
+    similarity = similarity.masked_fill(refused & ~itself, -1e4)
+    forward = torch.logsumexp(similarity, dim=2)
+    backward = torch.logsumexp(similarity, dim=1)
+    right = torch.diagonal(similarity, dim1=1, dim2=2)
+    loss = 0.5 * (forward + backward) - right
+    return (loss * valid).sum() / valid.sum().clamp(min=1)
+
+
+def hinge_loss(
+    a: Tensor,
+    b: Tensor,
+    points_b: Tensor,
+    centres: Tensor,
+    valid: Tensor,
+    positive_margin: float = 1.0,
+    negative_margin: float = 0.2,
+    positive_weight: float = 250.0,
+) -> Tensor:
+    """SuperPoint's dense hinge loss between all cells of two views (its equations 4 to 6).
+
+    Args:
+        a, b: (B, N, D) unit descriptors of all cells of either view.
+        points_b: (B, N, 2) where the centres of the cells of view a lie in view b.
+        centres: (N, 2) centres of the cells; a pair of cells corresponds within 8 pixels.
+        valid: (B, N) bool, cells of view a that view b shows.
+    """
+    similarity = torch.einsum("bnd,bmd->bnm", a, b)
+    same = (torch.cdist(points_b, centres.expand(len(a), -1, -1)) <= 8) & valid[:, :, None]
+    positive = positive_weight * (positive_margin - similarity).clamp(min=0)
+    negative = (similarity - negative_margin).clamp(min=0)
+    return (torch.where(same, positive, negative) * valid[:, :, None]).sum() / (valid.sum().clamp(min=1) * b.shape[1])

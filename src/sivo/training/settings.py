@@ -1,0 +1,103 @@
+"""The settings of the training stages; importable without torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class OptimiserSettings:
+    """How weights are updated; the same for every stage."""
+
+    steps: int = 20000
+    batch_size: int = 8  # images (shapes) or pairs of images (homographies) a step
+    learning_rate: float = 1.5e-3
+    weight_decay: float = 1e-4
+    warmup_steps: int = 50  # linear from zero
+    decay_steps: int = 4000  # the last steps, over which the rate falls linearly to zero
+    clip_norm: float = 5.0  # largest L2 norm of the gradient
+    ema: float = 0.998  # decay of the moving average of the weights; the average is what is saved
+    seed: int = 0
+    device: str = "auto"  # auto takes CUDA where there is one
+    # bfloat16 halves to thirds the time of a step where the processor has it (AVX-512 BF16, AMX, CUDA)
+    precision: str = "auto"  # auto | float32 | bfloat16
+    threads: int = 0  # of torch on the CPU; 0 leaves its default
+    workers: int = 1  # processes that prepare batches; 0 prepares them in the training process
+    checkpoint_minutes: float = 3.0
+    log_every: int = 20  # steps between rows of metrics.jsonl
+
+
+@dataclass(frozen=True)
+class ViewSettings:
+    """Random views of a picture, as a moving camera would see it."""
+
+    height: int = 120
+    width: int = 160
+    smallest_zoom: float = 0.55  # pixels of the picture per pixel of the view, log-uniform
+    largest_zoom: float = 2.0
+    rotation_degrees: float = 45.0  # largest in-plane rotation between a view and the picture
+    perspective: float = 0.2  # largest displacement of a corner, as a share of the view's side
+    stretch: float = 0.35  # largest log-ratio of the scales along two perpendicular directions (foreshortening)
+    shift: float = 0.3  # largest distance of the second view's centre from the first's, as a share of its side
+
+
+@dataclass(frozen=True)
+class PhotometricSettings:
+    """Random changes of light and sensor. A share is the probability that a change is applied."""
+
+    brightness: float = 40.0  # grey levels, largest
+    contrast: tuple[float, float] = (0.5, 1.4)
+    gamma: tuple[float, float] = (0.6, 1.7)
+    shade_share: float = 0.4
+    shade: float = 0.55  # largest darkening or brightening of a soft ellipse
+    vignette_share: float = 0.2
+    blur_share: float = 0.25
+    blur_sigma: float = 1.5  # pixels, largest
+    motion_share: float = 0.3
+    motion_length: int = 8  # pixels, longest
+    noise: float = 14.0  # grey levels, largest standard deviation
+    speckle: float = 0.0015  # largest share of pixels that become black or white
+    jpeg_share: float = 0.3
+    jpeg_quality: tuple[int, int] = (40, 95)
+
+
+@dataclass(frozen=True)
+class AdaptationSettings:
+    """Homographic adaptation: what a detector finds again in many random views of a picture."""
+
+    views: int = 30
+    keypoints_per_view: int = 300
+    border: int = 3  # pixels along the edge of a view that count for nothing
+    suppression: int = 4  # pixels, radius of non-maximum suppression on the consensus
+    # share of the views in which a point must be found again to be a label, and above which it is left undecided
+    accepted: float = 0.3
+    undecided: float = 0.15
+
+
+@dataclass(frozen=True)
+class HomographiesSettings:
+    """`sivo train homographies`: homographic adaptation, then detector and descriptor on pairs of views."""
+
+    architecture: str = "superpoint"
+    longer_side: int = 320  # pixels; larger pictures are reduced on loading
+    shapes: int = 450  # drawn pictures with exact corners among the others; 0 leaves them out
+    shapes_share: float = 0.12  # of the pairs
+    descriptor_loss: str = "info_nce"  # info_nce | hinge (SuperPoint's own)
+    descriptor_weight: float = 1.0
+    points: int = 256  # correspondences a pair; half of them at labelled keypoints
+    masked_pixels: float = 8.0  # points nearer than this are not each other's negatives
+    optimiser: OptimiserSettings = field(default_factory=OptimiserSettings)
+    views: ViewSettings = field(default_factory=ViewSettings)
+    photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
+    adaptation: AdaptationSettings = field(default_factory=AdaptationSettings)
+
+
+@dataclass(frozen=True)
+class ShapesSettings:
+    """`sivo train shapes`: a detector from drawn shapes alone ("MagicPoint")."""
+
+    architecture: str = "superpoint"
+    optimiser: OptimiserSettings = field(default_factory=lambda: OptimiserSettings(batch_size=32))
+    views: ViewSettings = field(default_factory=ViewSettings)
+    photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
+    adaptation: AdaptationSettings = field(default_factory=AdaptationSettings)

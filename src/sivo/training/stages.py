@@ -1,0 +1,222 @@
+"""The training stages as verbs: from settings and pictures to a folder with weights, model card and metrics."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from sivo import __version__, config, files
+from sivo.errors import ConfigError, InputError
+from sivo.frontend.architecture import ARCHITECTURES, Architecture
+from sivo.frontend.superpoint import SuperPoint
+from sivo.frontend.weights import DataSource, ModelCard, Weights, load_weights, save_weights
+from sivo.training.adaptation import Detector, adapt, network_detector, shi_tomasi
+from sivo.training.homographies import JointStage
+from sivo.training.labels import PointLabels, load_labels, save_labels
+from sivo.training.magic_point import MagicPointStage
+from sivo.training.pairs import PairBatches
+from sivo.training.pictures import Pictures, load_pictures
+from sivo.training.settings import HomographiesSettings, ShapesSettings
+from sivo.training.synthetic import ShapeBatches, shape_source
+from sivo.training.trainer import Batches, Stage, Trainer, choose_device
+from sivo.training.widen import widen
+
+WEIGHTS = "weights.safetensors"
+SETTINGS = "settings.yaml"
+LABELS = "labels.npz"
+SHAPES = DataSource("procedural shapes", "Apache-2.0", "Drawn by sivo.training.shapes.")
+
+
+def train_shapes(
+    settings: ShapesSettings, output: Path, start: Path | None = None, progress: bool = True
+) -> dict[str, Any]:
+    """Stage 1: a detector from drawn shapes alone; returns the last row of metrics."""
+    network, parent = _network(settings.architecture, settings.optimiser.seed, start)
+    card = _card(network.architecture, "shapes", settings, (SHAPES,), parent)
+    return _run(MagicPointStage(network), ShapeBatches(settings), settings, output, card, progress)
+
+
+def train_homographies(
+    sources: Sequence[str],
+    settings: HomographiesSettings,
+    output: Path,
+    start: Path | None = None,
+    detector: Path | None = None,
+    data: tuple[DataSource, ...] = (),
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Stage 2: homographic adaptation of the pictures, then joint training; returns the last row of metrics.
+
+    Args:
+        sources: see `load_pictures`.
+        start: weights to start from; None starts from random ones.
+        detector: weights whose detector labels the pictures; None takes classical corners.
+        data: what the model card says about the pictures; the sources' names where it is empty.
+    """
+    pictures = load_pictures(sources, settings.longer_side, progress)
+    for name in pictures.skipped:
+        print(f"skipped {name}: cannot be read")
+    if pictures.skipped:
+        print(f"{len(pictures.skipped)} pictures skipped, {len(pictures)} read")
+    network, parent = _network(settings.architecture, settings.optimiser.seed, start)
+    files.make_output_folder(output, "train homographies")
+    labels = _labels(pictures, settings, output, detector, progress)
+    if not data:
+        data = tuple(DataSource(source.name, "not stated") for source in pictures.sources)
+    if settings.shapes:
+        weight = settings.shapes_share / (1 - settings.shapes_share) * sum(s.weight for s in pictures.sources)
+        source, drawn = shape_source(settings.shapes, settings.optimiser.seed, weight)
+        pictures = replace(pictures, sources=(*pictures.sources, source))
+        labels, data = [*labels, drawn], (*data, SHAPES)
+    card = _card(network.architecture, "homographies", settings, data, parent)
+    card.training.update(
+        detector_labels=str(detector.name) if detector else "shi-tomasi", pictures=len(pictures),
+        pictures_skipped=len(pictures.skipped),
+    )  # fmt: skip
+    stage = JointStage(network, settings)
+    return _run(stage, PairBatches(pictures, labels, settings), settings, output, card, progress)
+
+
+def _run(
+    stage: Stage,
+    batches: Batches,
+    settings: ShapesSettings | HomographiesSettings,
+    output: Path,
+    card: ModelCard,
+    progress: bool,
+) -> dict[str, Any]:
+    """Train, and leave weights, card, metrics and settings in the folder; continues what is already there."""
+    files.make_output_folder(output, f"train {card.training['stage']}")
+    _same_settings(output / SETTINGS, settings)
+    trainer = Trainer(stage, batches, settings.optimiser, output)
+    if trainer.resume() and progress:
+        print(f"{output}: continues at step {trainer.step} of {settings.optimiser.steps}")
+
+    def save(trainer: Trainer) -> None:
+        row = json.loads((output / "metrics.jsonl").read_text().splitlines()[-1])
+        tensors = {name: value.cpu().numpy() for name, value in trainer.average.network.state_dict().items()}
+        training = {**card.training, "steps": trainer.step, "seconds": round(trainer.seconds)}
+        save_weights(output / WEIGHTS, tensors, replace(card, training=training, metrics=row))
+
+    trainer.run(progress, on_checkpoint=save)
+    last: dict[str, Any] = json.loads((output / "metrics.jsonl").read_text().splitlines()[-1])
+    return last
+
+
+def _network(name: str, seed: int, start: Path | None) -> tuple[SuperPoint, str]:
+    """A network without the stability head, which only VO adaptation can teach, and the name of its parent weights."""
+    if name not in ARCHITECTURES:
+        raise ConfigError(f"architecture {name}: unknown; choose among {', '.join(ARCHITECTURES)}")
+    torch.manual_seed(seed)
+    network = SuperPoint(replace(ARCHITECTURES[name], stability=False))
+    if start is None:
+        return network, ""
+    weights = load_weights(start)
+    own = {key: value for key, value in weights.tensors.items() if not key.startswith("stability.")}
+    if _widths(weights.architecture) != _widths(network.architecture):
+        own = widen(own, weights.architecture, network.architecture, np.random.default_rng(seed))
+    network.load_state_dict({key: torch.from_numpy(value) for key, value in own.items()}, strict=False)
+    return network, start.name
+
+
+def _widths(architecture: Architecture) -> Architecture:
+    return replace(architecture, name="", stability=False)
+
+
+def _labels(
+    pictures: Pictures, settings: HomographiesSettings, output: Path, detector: Path | None, progress: bool
+) -> list[list[PointLabels]]:
+    """Labels of the pictures, made once and kept in the folder."""
+    path = output / LABELS
+    if path.is_file():
+        return load_labels(path, [len(source.pictures) for source in pictures.sources])
+    detect: Detector = shi_tomasi()
+    if detector:
+        weights = load_weights(detector)
+        detect = network_detector(loaded(weights), choose_device(settings.optimiser.device), settings.adaptation)
+    labels = adapt(pictures, detect, settings.adaptation, settings.views, settings.optimiser.seed, progress)
+    if not sum(len(picture.points) for source in labels for picture in source):
+        raise InputError("homographic adaptation found no keypoint in any picture; the detector has learned nothing")
+    save_labels(path, labels)
+    return labels
+
+
+def loaded(weights: Weights) -> SuperPoint:
+    """The network with these weights, for inference in torch."""
+    network = SuperPoint(weights.architecture)
+    network.load_state_dict({key: torch.from_numpy(value) for key, value in weights.tensors.items()}, strict=False)
+    return network.eval()
+
+
+def _card(
+    architecture: Architecture,
+    stage: str,
+    settings: ShapesSettings | HomographiesSettings,
+    data: tuple[DataSource, ...],
+    parent: str,
+) -> ModelCard:
+    return ModelCard(
+        architecture=architecture,
+        licence="Apache-2.0",
+        data=data,
+        training={
+            "stage": stage,
+            "start": parent or "random",
+            "stability_trained": False,
+            "seed": settings.optimiser.seed,
+            "settings": config.to_dict(settings),
+            "versions": {"sivo": __version__, "torch": str(torch.__version__), "numpy": np.__version__},
+        },
+        commit=_commit(),
+        notes="The stability head is not part of these weights: only VO adaptation can teach it.",
+    )
+
+
+def _commit() -> str:
+    """The commit of the code, where it runs from a checkout."""
+    import subprocess
+
+    git = shutil.which("git")
+    if git is None:
+        return ""
+    here = Path(__file__).parent
+    answer = subprocess.run([git, "-C", str(here), "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    return answer.stdout.strip()
+
+
+# what a continued run may change: none of these alters a step that was already made
+_FREE = ("steps", "decay_steps", "device", "threads", "workers", "checkpoint_minutes", "log_every")
+
+
+def _same_settings(path: Path, settings: ShapesSettings | HomographiesSettings) -> None:
+    """Remember the settings of the folder; refuse to continue it under others."""
+
+    def fixed(values: dict[str, Any]) -> dict[str, Any]:
+        optimiser = {key: value for key, value in values["optimiser"].items() if key not in _FREE}
+        return {**values, "optimiser": optimiser}
+
+    if path.is_file():
+        before, now = fixed(config.to_dict(config.load(type(settings), path))), fixed(config.to_dict(settings))
+        changed = _changed(before, now)
+        if changed:
+            raise ConfigError(
+                f"{path.parent}: was begun with another {changed[0]}; give the same settings or another output folder"
+            )
+    files.write_text(path, config.to_yaml(settings))
+
+
+def _changed(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> list[str]:
+    names = []
+    for key, value in now.items():
+        if isinstance(value, dict):
+            names += _changed(before[key], value, f"{prefix}{key}.")
+        elif before[key] != value:
+            names.append(prefix + key)
+    return names
