@@ -23,6 +23,7 @@ _SEQUENCE_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("stride", {"type": int, "metavar": "N", "help": "every n-th frame (default: 1)"}),
     ("max-frames", {"type": int, "metavar": "N", "help": "at most so many, after the stride (default: all)"}),
     ("width", {"type": int, "metavar": "PIXELS", "help": "resize to this width (default: as recorded)"}),
+    ("topic", {"metavar": "NAME", "help": "image topic of a ROS bag, or camera of a recording with several"}),
 )
 
 
