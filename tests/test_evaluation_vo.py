@@ -1,0 +1,181 @@
+"""`sivo evaluate trajectory` and `sivo evaluate vo`: files in, tables out, errors in one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evaluation_scene import CAMERA, PlaneFeatures, PlaneSequence
+from sivo.cli.main import main
+from sivo.errors import InputError
+from sivo.evaluation import vo
+from sivo.evaluation.settings import TrajectorySettings
+from sivo.evaluation.trajectory_tables import vo_tables
+from sivo.evaluation.vo import WITH, WITHOUT, evaluate_vo, usable
+from sivo.frontend import Frontend
+from sivo.geometry.se3 import rigid, so3_exp
+from sivo.odometry.settings import OdometrySettings
+from sivo.sequences.trajectory_files import write_trajectory
+from sivo.types import Features, Frame, Trajectory, UInt8
+
+
+def trajectory(seconds: float = 6.0) -> Trajectory:
+    times = np.arange(int(seconds * 10) + 1) / 10
+    turn = np.column_stack([0.1 * times, 0.2 * times, 0 * times])
+    return Trajectory(times, rigid(so3_exp(turn), np.column_stack([times, np.sin(times), 0.1 * times])))
+
+
+def test_trajectory_command_prints_tables_and_leaves_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth = trajectory()
+    poses = truth.world_from_cam.copy()
+    poses[:, :3, 3] *= 0.5
+    segment = (np.arange(len(truth)) > 40).astype(np.int64)
+    write_trajectory(tmp_path / "truth.txt", truth)
+    write_trajectory(tmp_path / "estimate.txt", Trajectory(truth.times, poses, segment))
+    words = ["evaluate", "trajectory", str(tmp_path / "estimate.txt"), str(tmp_path / "truth.txt")]
+    assert main([*words, "--distances", "1", "-o", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    assert "| No prediction" in printed
+    assert "no window of 10 s: the longest segment is 4 s" in printed
+    assert "nan" not in printed
+    found = json.loads((tmp_path / "out" / "trajectory.json").read_text())
+    assert [s["scale"] for s in found["segments"]] == pytest.approx([2.0, 2.0])
+    assert found["ate_m"]["rmse"] < 1e-6
+    assert main([*words, "--alignment", "se3"]) == 0
+    assert "alignment se3" in capsys.readouterr().out
+
+
+def test_kitti_files_of_one_length_count_the_same_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth = trajectory()
+    for name in ("estimate", "truth"):
+        (tmp_path / name).mkdir()
+        write_trajectory(tmp_path / name / "poses.txt", truth, "kitti")
+    (tmp_path / "truth" / "times.txt").write_text("".join(f"{time * 1.037:.6e}\n" for time in truth.times))
+    words = ["evaluate", "trajectory", str(tmp_path / "estimate" / "poses.txt"), str(tmp_path / "truth" / "poses.txt")]
+    assert main(words) == 0
+    assert capsys.readouterr().out.startswith("61 poses at a common time")
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (lambda path: path.write_text("no numbers here\n"), "trajectory"),
+        (lambda path: path.write_text("100 0 0 0 0 0 0 1\n101 0 0 1 0 0 0 1\n"), "no common time"),
+        (lambda path: path.write_text("0 nan 0 0 0 0 0 1\n"), "no valid pose"),
+        (lambda path: None, "cannot be read"),
+    ],
+)
+def test_bad_trajectories_are_one_line_errors(
+    tmp_path: Path, write: Any, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_trajectory(tmp_path / "truth.txt", trajectory())
+    write(tmp_path / "estimate.txt")
+    assert main(["evaluate", "trajectory", str(tmp_path / "estimate.txt"), str(tmp_path / "truth.txt")]) == 2
+    error = capsys.readouterr().err.strip()
+    assert message in error
+    assert "\n" not in error
+    assert "estimate.txt" in error
+
+
+def test_vo_on_a_real_sequence(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["evaluate", "vo", str(shared_data / "hololens-office"), "--stride", "1", "--max-frames", "24"]
+    words += ["--frontend", "orb", "--workers", "1", "--windows", "2", "60", "-o", str(tmp_path / "out")]
+    assert main(words) == 0
+    printed = capsys.readouterr().out
+    assert "orb has no stability head" in printed
+    assert "no window of 60 s" in printed
+    found = json.loads((tmp_path / "out" / "vo.json").read_text())
+    row = found["rows"][0]
+    assert row["tracked"] > 15
+    window = row["relative"][0]
+    assert window["translation_m"]["mean"] < 0.3 * window["no_prediction_translation_m"]
+    assert (tmp_path / "out" / "orb" / "hololens-office.txt").stat().st_size > 500
+
+
+class StabilityFrontend:
+    """Sees the true points, some of which jump about; its stability head knows which."""
+
+    name = "knowing"
+
+    def __init__(self, sequence: PlaneSequence) -> None:
+        self._sequence = sequence
+        self._next = 0
+
+    def __call__(self, image: UInt8) -> Features:
+        frame = Frame(self._next, 0.0, image, "")
+        self._next += 1
+        features = PlaneFeatures(noise=0.2).features(self._sequence, frame)
+        jumping = features.descriptors[:, 0] > 0.15  # about a fifth, the same points in every frame
+        rng = np.random.default_rng(frame.index)
+        keypoints = features.keypoints + rng.uniform(-6, 6, features.keypoints.shape) * jumping[:, None]
+        stability = np.where(jumping, 0.001, 1.0).astype(np.float32)
+        return Features(keypoints.astype(np.float32), features.descriptors, features.scores, stability)
+
+
+class IterablePlane(PlaneSequence):
+    """A plane sequence that the odometry can run on."""
+
+    @property
+    def recording(self) -> Any:
+        return self
+
+    def __iter__(self) -> Any:
+        return (self[i] for i in range(len(self)))
+
+
+class IterableSource:
+    path = "/scenes/plane"
+
+    def open(self) -> Any:
+        return IterablePlane(frames=40)
+
+
+def test_table_2_compares_both_variants_on_the_same_features(monkeypatch: pytest.MonkeyPatch) -> None:
+    def knowing(name: str, max_keypoints: int) -> Frontend:
+        return StabilityFrontend(IterablePlane(frames=40))
+
+    monkeypatch.setattr(vo, "load_odometry_frontend", knowing)
+    settings = TrajectorySettings(time_windows=(0.5,))
+    sources: Any = [IterableSource()]
+    outcomes, found = evaluate_vo(sources, ["knowing"], 500, OdometrySettings(initialisation="paper"), settings)
+    assert [o.variant for o in outcomes] == [WITHOUT, WITH]
+    assert [row["variant"] for row in found["rows"]] == [WITHOUT, WITH]
+    errors = [row["relative"][0]["translation_m"]["mean"] for row in found["rows"]]
+    assert errors[1] < errors[0]  # knowing which points jump helps
+    text = vo_tables(found)
+    assert f"knowing {WITH}" in text
+    assert "| No prediction" in text
+    assert CAMERA.width == 160
+
+
+def test_sequences_with_invalid_truth_are_left_out_and_named() -> None:
+    class Broken(IterablePlane):
+        @property
+        def ground_truth(self) -> Trajectory | None:
+            truth = super().ground_truth
+            assert truth is not None
+            truth.world_from_cam[3] = np.nan
+            return truth
+
+    class BrokenSource(IterableSource):
+        def open(self) -> Any:
+            return Broken(name="broken")
+
+    sources: Any = [IterableSource(), BrokenSource()]
+    chosen, excluded = usable(sources)
+    assert chosen == sources[:1]
+    assert excluded[0].sequence == "broken"
+    assert excluded[0].reason.startswith("1 of 20 true poses")
+    with pytest.raises(InputError, match="no sequence is left"):
+        usable(sources[1:])
+
+
+def test_exported_images_are_the_frames_of_the_pairs(shared_data: Path, tmp_path: Path) -> None:
+    words = ["evaluate", "pose", str(shared_data / "hololens-office"), "--gaps", "2", "--pairs", "3"]
+    assert main([*words, "--export-images", str(tmp_path / "images")]) == 0
+    written = sorted((tmp_path / "images" / "hololens-office").glob("*.png"))
+    assert 4 <= len(written) <= 6
