@@ -22,6 +22,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "weights": ("weights", "import public weights, prepare weights for int8, print a model card"),
     "export": ("export", "what other tools read: ONNX"),
     "simulate": ("simulate", "render rooms with exact depth, poses and causes of instability"),
+    "info": ("info", "what a recording was recognised as, and what is wrong with it"),
     "config": ("config", "print all settings of a command as YAML"),
 }
 
