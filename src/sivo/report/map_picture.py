@@ -57,7 +57,9 @@ def draw_map(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"], l
     links = np.stack([path_2d[:-1], path_2d[1:]], axis=1)
     joined = trajectory.segment[:-1] == trajectory.segment[1:]
     colours = palette.ramp_colours(run.positions[1:].astype(float), 0, max(run.frames - 1, 1)) / 255.0
-    axis.add_collection(LineCollection(list(links[joined]), colors=colours[joined], linewidths=3.0, zorder=3))
+    axis.add_collection(
+        LineCollection(list(links[joined]), colors=colours[joined], linewidths=3.0, capstyle="round", zorder=3)
+    )
     axis.add_collection(
         LineCollection(list(links[~joined]), colors="white", linewidths=1.0, linestyles="dotted", zorder=2)
     )

@@ -28,7 +28,7 @@ class StabilityFrontend(Protocol):
 def paint_stability(
     image: UInt8, frontend: StabilityFrontend, name: str, palette: Palette = PALETTES["paper"], width: int = 1280
 ) -> UInt8:
-    """The picture of one frame: heat from unstable to stable, keypoints, and circles around suppressed regions.
+    """The picture of one frame: heat from stable (cold) to unstable (hot), keypoints, and circles around suppressed regions.
 
     Raises:
         InputError: the network has no stability head.
@@ -36,7 +36,7 @@ def paint_stability(
     stability = frontend.stability_map(image)
     features = frontend(image)
     assert features.stability is not None  # stability_map has raised otherwise
-    heat = palette.ramp_colours(stability.ravel(), 0, 1).reshape(*stability.shape, 3)
+    heat = palette.ramp_colours(1 - stability.ravel(), 0, 1).reshape(*stability.shape, 3)
     mixed = (0.55 * image[..., None] + 0.45 * heat).astype(np.uint8)
     canvas = Canvas(mixed, brightness=1.0, width=width)
     low = features.stability < _SUPPRESSED
@@ -47,7 +47,7 @@ def paint_stability(
     return canvas.with_caption(
         f"{name}: {int((~low).sum())} stable keypoints (white), {int(low.sum())} suppressed (black; circles: "
         f"{len(centres)} regions with most)",
-        (palette.ramp_strip(), "unstable", "stable"),
+        (palette.ramp_strip(), "stable", "unstable"),
     )
 
 
