@@ -12,6 +12,7 @@ from sivo.odometry.run_settings import RunSettings
 
 if TYPE_CHECKING:
     from sivo.odometry.run import RunSummary
+    from sivo.odometry.viewer import Viewer
     from sivo.sequences import Sequence
 
 _FLAGS = {
@@ -49,6 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-stability", action="store_true", help="weigh all observations alike (default: by stability)"
     )
+    parser.add_argument("--view", action="store_true", help="watch the run in Rerun (pip install 'sivo[view]')")
+    parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="record it for Rerun; works without a screen")
+    parser.add_argument("--report", action="store_true", help="write OUT/report.html at the end, as `sivo report` does")
     parser.add_argument("--seed", type=int, default=argparse.SUPPRESS, help="of all random choices (default: 0)")
     add_sequence_arguments(parser)
     add_config_arguments(parser)
@@ -69,12 +73,26 @@ def run(arguments: argparse.Namespace) -> int:
         f"{sequence.name}: {sequence.format}, {len(sequence)} frames of {camera.width}x{camera.height}; "
         f"frontend {settings.frontend.name}; poses and map are up to scale"
     )
-    summary = _track(sequence, arguments.output, settings)
+    summary = _track(sequence, arguments.output, settings, _viewer(arguments))
     _print_summary(summary)
+    if arguments.report:
+        from sivo.report.pages import write_report
+
+        write_report(arguments.output, arguments.output / "report.html")
+        print(f"page in {arguments.output / 'report.html'}")
     return 130 if summary.report["interrupted"] else 0
 
 
-def _track(sequence: Sequence, folder: Path, settings: RunSettings) -> RunSummary:
+def _viewer(arguments: argparse.Namespace) -> Viewer | None:
+    """Rerun where somebody wants to look."""
+    if not arguments.view and arguments.save is None:
+        return None
+    from sivo.report.rerun_viewer import RerunViewer
+
+    return RerunViewer(arguments.save)
+
+
+def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: Viewer | None) -> RunSummary:
     """The run with its progress line."""
     from tqdm import tqdm
 
@@ -92,7 +110,7 @@ def _track(sequence: Sequence, folder: Path, settings: RunSettings) -> RunSummar
             if lost:
                 bar.set_postfix(without_pose=lost, refresh=False)
 
-        return run_odometry(sequence, folder, settings, progress=progress)
+        return run_odometry(sequence, folder, settings, viewer=viewer, progress=progress)
 
 
 def _print_summary(summary: RunSummary) -> None:

@@ -33,6 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--sequence", type=Path, metavar="PATH", help="where the recording is now (default: where it was)"
         )
         _add_frames(frames)
+    live = _picture(pictures, "live", "a finished run in Rerun: camera, frames, tracks, map by label", show_live)
+    live.add_argument(
+        "--sequence", type=Path, metavar="PATH", help="where the recording is now (default: where it was)"
+    )
+    live.add_argument("--no-images", action="store_true", help="leave out the frames, which need the recording")
     _add_recording_pictures(pictures)
     accuracy = _picture(pictures, "accuracy", "pose accuracy against threshold, of several frontends", show_accuracy)
     accuracy.add_argument("--estimator", help="only this solver (default: one picture for each)")
@@ -69,7 +74,8 @@ def _picture(
     else:
         parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a recording, or the folder of a run")
         default = f"./{name}.png"
-    parser.add_argument("-o", "--output", type=Path, metavar="PATH", help=f"file or folder (default: {default})")
+    where = "file to record (default: open the viewer)" if name == "live" else f"file or folder (default: {default})"
+    parser.add_argument("-o", "--output", "--save", type=Path, metavar="PATH", help=where)
     if name != "accuracy":
         parser.add_argument("--palette", choices=("paper", "colour-blind"), default="paper", help="of the picture")
     parser.set_defaults(show=function)
@@ -181,6 +187,18 @@ def show_matches(arguments: argparse.Namespace) -> None:
     target = target_path(arguments.output, Path(), "matches.png")
     write_png(target, np.concatenate(rows))
     print(target)
+
+
+def show_live(arguments: argparse.Namespace) -> None:
+    """`sivo show live`."""
+    from sivo.report.palettes import palette
+    from sivo.report.rerun_viewer import show_run
+    from sivo.report.run_folder import RunFolder
+
+    run_folder = RunFolder(arguments.folder, arguments.sequence)
+    show_run(run_folder, arguments.output, palette(arguments.palette), images=not arguments.no_images)
+    if arguments.output:
+        print(arguments.output)
 
 
 def show_accuracy(arguments: argparse.Namespace) -> None:

@@ -28,7 +28,7 @@ class StabilityFrontend(Protocol):
 def paint_stability(
     image: UInt8, frontend: StabilityFrontend, name: str, palette: Palette = PALETTES["paper"], width: int = 1280
 ) -> UInt8:
-    """The picture of one frame: heat from stable (cold) to unstable (hot), keypoints, and circles around suppressed regions.
+    """The picture of one frame: heat from stable to unstable, keypoints, circles around suppressed regions.
 
     Raises:
         InputError: the network has no stability head.

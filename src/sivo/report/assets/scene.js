@@ -11,7 +11,7 @@
   const poses = floats(data.poses); // 12 a pose: centre, then the camera's x, y and z axes
   const count = poses.length / 12;
   const context = canvas.getContext("2d");
-  const start = { yaw: -0.5, pitch: 0.85, distance: 2.1 * data.radius, centre: [...data.centre] };
+  const start = { yaw: -0.5, pitch: 0.85, distance: 1.6 * data.radius, centre: [...data.centre] };
   const view = { ...start, centre: [...start.centre] };
   let layer = Object.keys(layers)[0];
   let current = count - 1;
@@ -38,7 +38,7 @@
     pixels.fill(0xff352f2b);
     const { xyz, rgb } = layers[layer];
     const out = [0, 0, 0];
-    const size = Math.max(1, Math.round(Math.min(width, height) / 420));
+    const size = Math.max(1, Math.round(Math.min(width, height) / 280));
     for (let i = 0; i < xyz.length / 3; i++) {
       project(xyz[3 * i], xyz[3 * i + 1], xyz[3 * i + 2], out);
       const x = out[0] | 0, y = out[1] | 0;
