@@ -9,10 +9,10 @@ import pytest
 
 from sivo.backend import BundleProblem, ObjectiveSettings, SolverSettings, solve
 from sivo.backend.arrange import CHUNK, arrange
-from sivo.backend.eliminate import back_substitute, eliminate
+from sivo.backend.eliminate import eliminate
 from sivo.backend.linearise import linearise
 from sivo.backend.objective import cost
-from sivo.backend.reduced import solve_reduced
+from sivo.backend.reduced import solve_step
 from sivo.backend.reference import normal_equations, solve_dense
 from sivo.backend.simulated import simulated_window
 from sivo.geometry import se3
@@ -48,8 +48,7 @@ def one_step(problem: BundleProblem, damping: float) -> tuple[np.ndarray, np.nda
     constants, observations, system = arrange(problem, objective)
     linearise(constants, observations, system, problem.cam_from_world, problem.points)
     assert eliminate(observations, system, damping, 1e-6)
-    assert solve_reduced(system)
-    back_substitute(observations, system)
+    assert solve_step(observations, system)
     fast = np.concatenate([system.camera_step.ravel(), system.point_step[problem.free_points].ravel()])
     hessian, gradient = normal_equations(problem, objective, problem.cam_from_world, problem.points)
     damped = hessian + damping * np.diag(np.maximum(np.diag(hessian), 1e-6))

@@ -18,7 +18,7 @@ def kernels_are_cached() -> bool:
     """Whether a compiled copy of the solver is on disk; it may still be stale, which only costs a compilation."""
     from sivo.backend import reduced, triangulation_kernels
 
-    kernels = (reduced.solve_reduced, triangulation_kernels.triangulate_all)
+    kernels = (reduced.solve_step, triangulation_kernels.triangulate_all)
     return all(any(Path(kernel.stats.cache_path).glob(f"*{kernel.__name__}-*.nbi")) for kernel in kernels)
 
 

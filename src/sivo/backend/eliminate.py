@@ -19,7 +19,6 @@ from sivo.backend.compiled import compiled
 def eliminate(observations, system, damping, min_diagonal):
     """Fill the reduced system and its right side (in `camera_step`); False where a block is not positive definite."""
     cameras = len(observations.camera_of_free)
-    system.reduced[:] = 0.0
     for camera in range(cameras):
         _start_block(system, camera, damping, min_diagonal)
     for j in observations.point_order:
@@ -55,6 +54,12 @@ def block_start(cameras, camera_a, camera_b):
 
 
 @compiled
+def chunk_end(start, cameras):
+    """The first camera after `start` whose columns lie in another piece of the rows."""
+    return min((start // CHUNK + 1) * CHUNK, cameras)
+
+
+@compiled
 def subtract_rank_3(rows, left, right0, right1, right2):
     """Take left^T right from six rows at once: the innermost loop, where half of the solver's time goes."""
     a0, a1, a2, a3, a4, a5 = left[0, 0], left[0, 1], left[0, 2], left[0, 3], left[0, 4], left[0, 5]
@@ -72,9 +77,17 @@ def subtract_rank_3(rows, left, right0, right1, right2):
 
 @compiled
 def _start_block(system, camera, damping, min_diagonal):
-    """The camera's own block, damped, and minus its gradient."""
+    """The rows of a camera before any point is taken from them: its own block, damped; and minus its gradient."""
     hessian = system.camera_hessian[camera]
-    block = system.reduced[block_start(len(system.camera_hessian), camera, camera) :]
+    cameras = len(system.camera_hessian)
+    start = camera
+    while start < cameras:
+        end = chunk_end(start, cameras)
+        row = block_start(cameras, camera, start)
+        for i in range(6):
+            system.reduced[row + i * STRIDE : row + i * STRIDE + COLUMN * (end - start)] = 0.0
+        start = end
+    block = system.reduced[block_start(cameras, camera, camera) :]
     for i in range(6):
         for k in range(i, 6):
             block[i * STRIDE + k] = hessian[i, k]
@@ -116,27 +129,34 @@ def _couple(observations, system, j, o, slot):
     """Y = (I; [x]) A R L^-T of one observation, transposed, in its slot; and its part of the right side."""
     x, y, z = system.in_camera[o, 0], system.in_camera[o, 1], system.in_camera[o, 2]
     root, coupling, rhs = system.point_root[j], system.coupling[o], system.point_rhs[j]
+    l00, l10, l11, l20, l21, l22 = root[0], root[1], root[2], root[3], root[4], root[5]
+    b00, b01, b02 = coupling[0, 0], coupling[0, 1], coupling[0, 2]
+    b10, b11, b12 = coupling[1, 0], coupling[1, 1], coupling[1, 2]
+    b20, b21, b22 = coupling[2, 0], coupling[2, 1], coupling[2, 2]
+    m00, m10, m20 = b00 * l00, b10 * l00, b20 * l00
+    m01, m11, m21 = b00 * l10 + b01 * l11, b10 * l10 + b11 * l11, b20 * l10 + b21 * l11
+    m02 = b00 * l20 + b01 * l21 + b02 * l22
+    m12 = b10 * l20 + b11 * l21 + b12 * l22
+    m22 = b20 * l20 + b21 * l21 + b22 * l22
+    m30, m40, m50 = y * m20 - z * m10, z * m00 - x * m20, x * m10 - y * m00
+    m31, m41, m51 = y * m21 - z * m11, z * m01 - x * m21, x * m11 - y * m01
+    m32, m42, m52 = y * m22 - z * m12, z * m02 - x * m22, x * m12 - y * m02
+
+    columns = system.elimination[:, COLUMN * slot : COLUMN * slot + POSE]
+    columns[0, 0], columns[0, 1], columns[0, 2] = m00, m10, m20
+    columns[0, 3], columns[0, 4], columns[0, 5] = m30, m40, m50
+    columns[1, 0], columns[1, 1], columns[1, 2] = m01, m11, m21
+    columns[1, 3], columns[1, 4], columns[1, 5] = m31, m41, m51
+    columns[2, 0], columns[2, 1], columns[2, 2] = m02, m12, m22
+    columns[2, 3], columns[2, 4], columns[2, 5] = m32, m42, m52
+    r0, r1, r2 = rhs[0], rhs[1], rhs[2]
     step = system.camera_step[observations.free_camera[o]]
-    for k in range(3):
-        if k == 0:
-            m0, m1, m2 = coupling[0, 0] * root[0], coupling[1, 0] * root[0], coupling[2, 0] * root[0]
-        elif k == 1:
-            m0 = coupling[0, 0] * root[1] + coupling[0, 1] * root[2]
-            m1 = coupling[1, 0] * root[1] + coupling[1, 1] * root[2]
-            m2 = coupling[2, 0] * root[1] + coupling[2, 1] * root[2]
-        else:
-            m0 = coupling[0, 0] * root[3] + coupling[0, 1] * root[4] + coupling[0, 2] * root[5]
-            m1 = coupling[1, 0] * root[3] + coupling[1, 1] * root[4] + coupling[1, 2] * root[5]
-            m2 = coupling[2, 0] * root[3] + coupling[2, 1] * root[4] + coupling[2, 2] * root[5]
-        m3, m4, m5 = y * m2 - z * m1, z * m0 - x * m2, x * m1 - y * m0
-        column = system.elimination[k, COLUMN * slot : COLUMN * slot + POSE]
-        column[0], column[1], column[2], column[3], column[4], column[5] = m0, m1, m2, m3, m4, m5
-        step[0] += m0 * rhs[k]
-        step[1] += m1 * rhs[k]
-        step[2] += m2 * rhs[k]
-        step[3] += m3 * rhs[k]
-        step[4] += m4 * rhs[k]
-        step[5] += m5 * rhs[k]
+    step[0] += m00 * r0 + m01 * r1 + m02 * r2
+    step[1] += m10 * r0 + m11 * r1 + m12 * r2
+    step[2] += m20 * r0 + m21 * r1 + m22 * r2
+    step[3] += m30 * r0 + m31 * r1 + m32 * r2
+    step[4] += m40 * r0 + m41 * r1 + m42 * r2
+    step[5] += m50 * r0 + m51 * r1 + m52 * r2
 
 
 @compiled

@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import math
 
-from sivo.backend.arrange import CHUNK, COLUMN, POSE, STRIDE
+from sivo.backend.arrange import COLUMN, POSE, STRIDE
 from sivo.backend.compiled import compiled
-from sivo.backend.eliminate import block_start, subtract_rank_3
+from sivo.backend.eliminate import back_substitute, block_start, chunk_end, subtract_rank_3
 
 
 @compiled
-def solve_reduced(system):
-    """Overwrite `camera_step` (the right side) with the solution of S step = right side; False where S is singular.
+def solve_step(observations, system):
+    """The step of cameras and points; False where S is singular.
 
-    S = C^T C with C upper triangular: C replaces S, then C^T y = right side and C step = y.
+    S = C^T C with C upper triangular: C replaces S, then C^T y = right side and C step = y, both in `camera_step`.
     """
     S, step = system.reduced, system.camera_step
     cameras = len(step)
@@ -30,6 +30,7 @@ def solve_reduced(system):
         _substitute_forwards(S, cameras, camera, step)
     for camera in range(cameras - 1, -1, -1):
         _substitute_backwards(S, cameras, camera, step)
+    back_substitute(observations, system)
     return True
 
 
@@ -42,7 +43,7 @@ def _factorise_rows(S, cameras, camera):
             scale = S[corner + above * STRIDE + i]
             start = camera
             while start < cameras:
-                end = _chunk_end(start, cameras)
+                end = chunk_end(start, cameras)
                 row, width = block_start(cameras, camera, start), COLUMN * (end - start)
                 target, source = row + i * STRIDE, row + above * STRIDE
                 _subtract_scaled(S[target : target + width], scale, S[source : source + width])
@@ -53,7 +54,7 @@ def _factorise_rows(S, cameras, camera):
         scale = 1.0 / math.sqrt(pivot)
         start = camera
         while start < cameras:
-            end = _chunk_end(start, cameras)
+            end = chunk_end(start, cameras)
             row = block_start(cameras, camera, start) + i * STRIDE
             for k in range(row, row + COLUMN * (end - start)):
                 S[k] *= scale
@@ -64,10 +65,11 @@ def _factorise_rows(S, cameras, camera):
 @compiled
 def _update_rows(S, cameras, camera, later):
     """Take the finished rows of a camera from those of a later one."""
-    left = _rows(S, block_start(cameras, camera, later), POSE)
+    column = block_start(cameras, camera, later)
+    left = S.reshape(len(S) // STRIDE, STRIDE)[column // STRIDE :, column % STRIDE : column % STRIDE + POSE]
     start = later
     while start < cameras:
-        end = _chunk_end(start, cameras)
+        end = chunk_end(start, cameras)
         width = COLUMN * (end - start)
         target = S[block_start(cameras, later, start) :]
         source = block_start(cameras, camera, start)
@@ -86,45 +88,35 @@ def _update_rows(S, cameras, camera, later):
 @compiled
 def _substitute_forwards(S, cameras, camera, step):
     """y of one camera, and its part taken from the right side of the later ones."""
-    corner = _rows(S, block_start(cameras, camera, camera), POSE)
+    corner = block_start(cameras, camera, camera)
     for i in range(POSE):
+        total = step[camera, i]
         for above in range(i):
-            step[camera, i] -= corner[above, i] * step[camera, above]
-        step[camera, i] /= corner[i, i]
+            total -= S[corner + above * STRIDE + i] * step[camera, above]
+        step[camera, i] = total / S[corner + i * STRIDE + i]
     for later in range(camera + 1, cameras):
-        block = _rows(S, block_start(cameras, camera, later), POSE)
+        block = block_start(cameras, camera, later)
         for i in range(POSE):
             for k in range(POSE):
-                step[later, k] -= block[i, k] * step[camera, i]
+                step[later, k] -= S[block + i * STRIDE + k] * step[camera, i]
 
 
 @compiled
 def _substitute_backwards(S, cameras, camera, step):
     """The step of one camera, from those of the later ones."""
     for later in range(camera + 1, cameras):
-        block = _rows(S, block_start(cameras, camera, later), POSE)
+        block = block_start(cameras, camera, later)
         for i in range(POSE):
+            total = step[camera, i]
             for k in range(POSE):
-                step[camera, i] -= block[i, k] * step[later, k]
-    corner = _rows(S, block_start(cameras, camera, camera), POSE)
+                total -= S[block + i * STRIDE + k] * step[later, k]
+            step[camera, i] = total
+    corner = block_start(cameras, camera, camera)
     for i in range(POSE - 1, -1, -1):
+        total = step[camera, i]
         for k in range(i + 1, POSE):
-            step[camera, i] -= corner[i, k] * step[camera, k]
-        step[camera, i] /= corner[i, i]
-
-
-@compiled
-def _rows(S, start, count):
-    """The block that starts there, as `count` rows of six."""
-    column = start % STRIDE
-    first = start // STRIDE
-    return S.reshape(len(S) // STRIDE, STRIDE)[first : first + count, column : column + POSE]
-
-
-@compiled
-def _chunk_end(start, cameras):
-    """The first camera after `start` whose columns lie in another piece of the rows."""
-    return min((start // CHUNK + 1) * CHUNK, cameras)
+            total -= S[corner + i * STRIDE + k] * step[camera, k]
+        step[camera, i] = total / S[corner + i * STRIDE + i]
 
 
 @compiled

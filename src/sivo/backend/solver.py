@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from sivo.backend.arrange import arrange
-from sivo.backend.eliminate import back_substitute, eliminate
+from sivo.backend.eliminate import eliminate
 from sivo.backend.linearise import errors_and_depths, evaluate, linearise
 from sivo.backend.problem import BundleProblem, BundleResult
-from sivo.backend.reduced import solve_reduced
+from sivo.backend.reduced import solve_step
 from sivo.backend.settings import ObjectiveSettings, SolverSettings
-from sivo.backend.step import apply_step, predicted_decrease
+from sivo.backend.step import try_step
 
 PARTS = ("arrange", "linearise", "eliminate", "solve", "evaluate")
 
@@ -59,15 +59,14 @@ def solve(
         with clock("eliminate"):
             solvable = eliminate(observations, system, damping, settings.min_diagonal)
         with clock("solve"):
-            solvable = solvable and solve_reduced(system)
-            if solvable:
-                back_substitute(observations, system)
+            solvable = solvable and solve_step(observations, system)
         decrease, gain = -np.inf, -np.inf
         if solvable:
             with clock("evaluate"):
-                apply_step(observations, system, poses, points, new_poses, new_points)
-                new_cost = evaluate(constants, observations, new_poses, new_points)
-                promised = predicted_decrease(system, damping, settings.min_diagonal)
+                new_cost, promised = try_step(
+                    constants, observations, system, damping, settings.min_diagonal,
+                    poses, points, new_poses, new_points,
+                )  # fmt: skip
             decrease = cost - new_cost
             converged = bool(abs(decrease) <= settings.relative_decrease * cost)
             # twice, because the promise is of half the objective; a cost that is not finite fails both comparisons

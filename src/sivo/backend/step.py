@@ -6,10 +6,18 @@ from __future__ import annotations
 import math
 
 from sivo.backend.compiled import compiled
+from sivo.backend.linearise import evaluate
 
 
 @compiled
-def apply_step(observations, system, poses, points, new_poses, new_points):
+def try_step(constants, observations, system, damping, min_diagonal, poses, points, new_poses, new_points):
+    """Write the state after the step; its cost, and the decrease of half the cost that the linear model promises."""
+    _apply_step(observations, system, poses, points, new_poses, new_points)
+    return evaluate(constants, observations, new_poses, new_points), _predicted_decrease(system, damping, min_diagonal)
+
+
+@compiled
+def _apply_step(observations, system, poses, points, new_poses, new_points):
     """new = exp(w) pose + v for the free cameras, point + dX for the points; the rest is copied."""
     new_poses[:] = poses
     for number in range(len(observations.camera_of_free)):
@@ -59,7 +67,7 @@ def _orthonormalise(pose):
 
 
 @compiled
-def predicted_decrease(system, damping, min_diagonal):
+def _predicted_decrease(system, damping, min_diagonal):
     """Half of (damping * step^T D step - gradient^T step): the decrease of half the objective, were it quadratic."""
     total = 0.0
     for camera in range(len(system.camera_step)):
