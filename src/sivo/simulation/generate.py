@@ -135,4 +135,4 @@ def _one_thread() -> None:
 
 def _write_labels(path: Path, causes: UInt8) -> None:
     with written_atomically(path) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", causes)[1].tobytes())
+        temporary.write_bytes(cv2.imencode(".png", causes, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes())

@@ -45,14 +45,14 @@ def floor_path(rng: np.random.Generator, floor: Floor, clearance: float, speed: 
     for _ in range(500):
         waves = np.arange(1, 4)
         wobble = 1 + (rng.uniform(0, 0.2, 3) * np.cos(angles[:, None] * waves + rng.uniform(0, 2 * np.pi, 3))).sum(axis=1)
-        reach = rng.uniform(0.3, 0.75, 2) * half
+        reach = rng.uniform(0.15, 0.75, 2) * half
         centre = rng.uniform(-0.6, 0.6, 2) * half
         points = centre + reach * np.column_stack([wobble * np.cos(angles), wobble * np.sin(angles)])
         length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
         least = min(float(floor.clearance(points).min()), clearance)
         if best is None or (least, length) > best[:2]:
             best = (least, length, points)
-    if best is None or best[0] < 0.15:
+    if best is None or best[0] < 0.08:
         raise ConfigError("the room is too full for a path; use fewer pieces of `furniture` or a larger `room_size`")
     dense = best[2][:: -1 if rng.uniform() < 0.5 else 1]
     steps = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(dense, axis=0), axis=1))])

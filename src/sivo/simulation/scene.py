@@ -16,6 +16,7 @@ from sivo.simulation.room import Floor, furnish
 from sivo.simulation.settings import SimulationSettings
 
 _TOO_NEAR = 0.75  # metres between the camera and a walker
+_IN_VIEW = 0.4  # share of the time that a walker is in view
 
 
 @dataclass(frozen=True)
@@ -49,22 +50,26 @@ def build_scene(settings: SimulationSettings) -> Scene:
 def _apart(
     rng: np.random.Generator, floor: Floor, camera: CameraPath, settings: SimulationSettings, speed: float
 ) -> FloorPath:
-    """A path on which a mover never comes too near to the camera, or the best of many."""
+    """A path on which a mover never comes too near to the camera, and is seen now and then."""
     times = np.arange(0, settings.frames / settings.fps, 0.2)
-    here = camera.path.position(times)
-    best: tuple[float, FloorPath] | None = None
-    for _ in range(12):
+    poses = camera.world_from_cam(times)
+    here, forward = poses[:, :2, 3], poses[:, :2, 2]
+    best: tuple[float, float, FloorPath] | None = None  # distance that counts, share of time in view, path
+    for _ in range(6):
         path = floor_path(rng, floor, 0.3, speed)
-        for _ in range(6):
+        for _ in range(10):
             path = FloorPath(path.spline, path.length, speed, float(rng.uniform(0, path.length)))
-            nearest = float(np.linalg.norm(path.position(times) - here, axis=1).min())
-            if best is None or nearest > best[0]:
-                best = (nearest, path)
-        if best and best[0] > _TOO_NEAR:
-            return best[1]
+            away = path.position(times) - here
+            distance = np.linalg.norm(away, axis=1)
+            seen = (away * forward).sum(axis=1) > np.cos(np.radians(settings.fov / 2)) * distance
+            score = (min(float(distance.min()), _TOO_NEAR), min(float(seen.mean()), _IN_VIEW))
+            if best is None or score > best[:2]:
+                best = (*score, path)
+        if best and best[:2] == (_TOO_NEAR, _IN_VIEW):
+            break
     if best is None or best[0] < 0.4:
         raise ConfigError("no room for a walker beside the camera; use fewer `walkers`, fewer frames or another seed")
-    return best[1]
+    return best[2]
 
 
 def _lights(shop: Workshop, floor: Floor, settings: SimulationSettings) -> None:
@@ -73,8 +78,8 @@ def _lights(shop: Workshop, floor: Floor, settings: SimulationSettings) -> None:
     x, y = pick(rng, (-0.2, 0.2)) * floor.width, pick(rng, (0.1, 0.3)) * floor.length * float(rng.choice([-1, 1]))
     glow = builder.material(None, colour=(1.0, 0.97, 0.9), emission=1.0, shine=0.0)
     builder.lathe(builder.world, [(0.0, -0.06), (0.16, -0.05), (0.18, 0.0)], (x, y, height), glow)
-    builder.light(builder.world, (x, y, height - 0.1), (0, 0, -1), 0.85 * settings.brightness, shadow=True, cutoff=84)
-    builder.light(builder.world, (-x, -y, 1.3), (0, 0, 1), 0.3 * settings.brightness, shadow=False, cutoff=180)
-    builder.light(builder.world, (x, -y, 1.9), (0, 0, -1), 0.35 * settings.brightness, shadow=False, cutoff=180)
+    builder.light(builder.world, (x, y, height - 0.1), (0, 0, -1), 0.7 * settings.brightness, shadow=True, cutoff=84)
+    builder.light(builder.world, (-x, -y, 1.2), (0, 0, 1), 0.4 * settings.brightness, shadow=False, cutoff=180)
+    builder.light(builder.world, (x, -y, 1.4), (0, 0, -1), 0.5 * settings.brightness, shadow=False, cutoff=180)
     if settings.swinging_lamp:
-        swinging_lamp(shop, (-x, -y), height, 0.7 * settings.brightness)
+        swinging_lamp(shop, (-x, -y), height, 0.45 * settings.brightness)
