@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> None:
     from sivo.sequences.survey import survey
 
     settings = settings_from(InfoSettings, arguments, {"samples": "samples"})
-    with tqdm(unit="pair", desc="info", delay=1.0) as bar:
+    with tqdm(unit="pair", desc="info", delay=1.0, leave=False) as bar:
         findings = survey(arguments.sequence, settings.sequence, max(1, settings.samples), bar.update).to_dict()
     if arguments.json:
         print(json.dumps(findings, indent=2))
@@ -70,8 +70,8 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
         (
             "pictures",
             f"{100 * facts['duplicates']:.0f} % repeated, {100 * facts['blurred']:.0f} % blurred, "
-            f"median grey {facts['brightness']:.0f}, {100 * facts['clipped']:.0f} % clipped, {facts['corners']} corners "
-            f"(of {facts['sampled']} sampled)",
+            f"median grey {facts['brightness']:.0f}, {100 * facts['clipped']:.0f} % clipped, "
+            f"{facts['corners']} corners, {facts['sampled']} sampled",
         ),
         ("gaps", str(len(facts["gaps"])) if facts["gaps"] else "none"),
     ]

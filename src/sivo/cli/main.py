@@ -21,9 +21,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "show": ("show", "the pictures of the paper, from a run, a recording or an evaluation"),
     "report": ("report", "one HTML page about a run, labels or an evaluation"),
     "weights": ("weights", "import public weights, prepare weights for int8, print a model card"),
-    "export": ("export", "what other tools read: ONNX"),
+    "export": ("export", "what other tools read: COLMAP, Nerfstudio, trajectories, ONNX"),
     "simulate": ("simulate", "render rooms with exact depth, poses and causes of instability"),
     "info": ("info", "what a recording was recognised as, and what is wrong with it"),
+    "calibrate": ("calibrate", "a camera from a recording of a board, and the board to print"),
     "config": ("config", "print all settings of a command as YAML"),
 }
 

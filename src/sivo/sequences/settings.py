@@ -1,4 +1,4 @@
-"""Settings of the commands that look at recordings, importable without heavy modules."""
+"""Settings of `sivo info`, importable without heavy modules."""
 
 from __future__ import annotations
 

@@ -243,7 +243,7 @@ def _judge(facts: dict[str, Any]) -> list[Problem]:
         dark = facts["brightness"] < DARK
         found.append(
             Problem(
-                f"the picture is very {'dark' if dark else 'bright'} (median grey level {facts['brightness']:.0f} of 255)",
+                f"the picture is very {'dark' if dark else 'bright'} (median grey {facts['brightness']:.0f} of 255)",
                 "add light or lengthen the exposure" if dark else "shorten the exposure",
             )
         )
