@@ -8,6 +8,9 @@ import importlib
 # target -> (module under sivo.cli, help line)
 TARGETS: dict[str, tuple[str, str]] = {
     "onnx": ("export_onnx", "a network with its decoding, for ONNX Runtime"),
+    "colmap": ("export_colmap", "a finished run as COLMAP's sparse model, with images"),
+    "nerfstudio": ("export_nerfstudio", "a finished run as Nerfstudio's transforms.json, with images"),
+    "trajectory": ("export_trajectory", "the poses of a finished run as TUM, KITTI or EuRoC file"),
 }
 
 
