@@ -171,6 +171,8 @@ class Trainer:
                 saved = now
                 if on_checkpoint:
                     on_checkpoint(self)
+        if self.share.processes > 1:
+            distributed.barrier()  # nobody goes on before the files are written
         network: nn.Module = self.average.network
         return network.eval()
 
