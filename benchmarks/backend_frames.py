@@ -10,7 +10,7 @@ import numpy as np
 import poselib
 
 from backend_windows import Recording, triangulate
-from sivo.backend import BundleProblem, BundleResult, SolverSettings, solve
+from sivo.backend import BundleProblem, BundleResult, SolverSettings, solve, triangulate_tracks
 from sivo.geometry import se3
 from sivo.geometry.alignment import align_points
 from sivo.types import Float64, Int64
