@@ -138,19 +138,6 @@ def test_points_of_the_map_are_measured_not_solved():
     assert labels.point.tolist() == list(range(len(solved)))
 
 
-def test_second_opinion_withholds_labels_where_the_odometry_is_not_trusted():
-    tracks, poses, segment, K = simulated_tracks()
-    trusted = np.arange(40) >= 20
-    labels = label_stability(tracks, poses, segment, K, trusted=trusted)
-    share = np.array([trusted[tracks.frame[tracks.track == track]].mean() for track in labels.track])
-    np.testing.assert_array_equal(labels.distrusted, share < 0.5)
-    assert 0 < labels.distrusted.sum() < len(labels)
-    assert (labels.stability[labels.distrusted] == IGNORE).all()
-    assert labels.counts()["withheld"] == labels.distrusted.sum()
-    off = label_stability(tracks, poses, segment, K, LabelSettings(second_opinion=False), trusted=trusted)
-    assert not off.distrusted.any()
-
-
 @pytest.mark.parametrize("values", [{"min_observations": 1}, {"stable_mean_error": 6.0}, {"loss": "l2"}])
 def test_impossible_settings_are_refused(values):
     with pytest.raises(ConfigError):

@@ -23,6 +23,7 @@ def some_labels(count: int = 5) -> TrackLabels:
         mean_error=rng.uniform(0, 3, count),
         max_error=rng.uniform(3, 9, count),
         stability=np.array([IGNORE, UNSTABLE, STABLE] * count, np.int8)[:count],
+        parallax_deg=rng.uniform(0, 5, count),
         distrusted=np.zeros(count, np.bool_),
         errors=rng.uniform(0, 9, 20),
     )

@@ -31,7 +31,8 @@ class TrackLabels:
     mean_error: Float64  # (T,) pixels; NaN without a point
     max_error: Float64  # (T,) pixels
     stability: NDArray[np.int8]  # (T,) IGNORE, UNSTABLE or STABLE
-    distrusted: NDArray[np.bool_]  # (T,) a label was withheld by the second opinion
+    parallax_deg: Float64  # (T,) largest angle between two rays from the point to cameras that saw it
+    distrusted: NDArray[np.bool_]  # (T,) a label was withheld by the second opinion (`sivo.labeling.trust`)
     errors: Float64  # (M,) pixels, per observation; NaN where it has none
 
     def __len__(self) -> int:
@@ -60,7 +61,6 @@ def label_stability(
     settings: LabelSettings | None = None,
     point: Int64 | None = None,
     point_xyz: Float64 | None = None,
-    trusted: NDArray[np.bool_] | None = None,
 ) -> TrackLabels:
     """Label whole tracks under final poses; any subset of tracks gives the same labels as all at once.
 
@@ -71,7 +71,6 @@ def label_stability(
         K: (3, 3).
         point: (T,) map point of each track in the order in which the tracks appear, -1 where none; for the record.
         point_xyz: (T, 3) where the odometry already has the point, NaN where it is to be solved here.
-        trusted: (F,) whether the odometry's pose is believed, for the second opinion; None: all are.
 
     Returns:
         Labels. A point behind one of the cameras that saw it is never called stable.
@@ -104,11 +103,6 @@ def label_stability(
 
     stability = classify(observations, mean_error, max_error, settings)
     stability[(stability == STABLE) & ~solved.in_front] = IGNORE
-    distrusted = np.zeros(count, np.bool_)
-    if settings.second_opinion and trusted is not None:
-        share = np.bincount(used, weights=trusted[tracks.frame[rows]], minlength=count) / np.maximum(observations, 1)
-        distrusted = (share < settings.min_trusted_share) & (stability != IGNORE)
-        stability[distrusted] = IGNORE
     return TrackLabels(
         track=tracks.track[first],
         point=np.full(count, -1, np.int64) if point is None else np.asarray(point, np.int64),
@@ -118,7 +112,8 @@ def label_stability(
         mean_error=mean_error,
         max_error=max_error,
         stability=stability,
-        distrusted=distrusted,
+        parallax_deg=solved.parallax_deg,
+        distrusted=np.zeros(count, np.bool_),
         errors=errors,
     )
 

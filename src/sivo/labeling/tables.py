@@ -43,6 +43,7 @@ def points_schema() -> pa.Schema:
             ("max_error", pa.float32()),
             ("stability", pa.dictionary(pa.int8(), pa.string())),
             ("segment", pa.int32()),  # x, y, z are in this segment's world
+            ("parallax", pa.float32()),  # degrees, largest angle between two of its rays
             ("withheld", pa.bool_()),  # the second opinion took its label away
         ]
     )
@@ -122,9 +123,11 @@ class PointsWriter(_TableWriter):
     def __init__(self, path: Path) -> None:
         super().__init__(path, points_schema())
 
-    def write(self, labels: TrackLabels) -> None:
+    def write(self, labels: TrackLabels | PointsTable) -> None:
         """Append one row per track."""
         import pyarrow as pa
+
+        withheld = labels.distrusted if isinstance(labels, TrackLabels) else labels.withheld
 
         stability = pa.DictionaryArray.from_arrays(pa.array(labels.stability, pa.int8()), list(STABILITY_NAMES))
         self._append(
@@ -137,7 +140,8 @@ class PointsWriter(_TableWriter):
                 labels.max_error.astype(np.float32),
                 stability,
                 labels.segment.astype(np.int32),
-                labels.distrusted,
+                labels.parallax_deg.astype(np.float32),
+                withheld,
             ]
         )
 
@@ -175,6 +179,8 @@ class PointsTable:
     max_error: Float32  # (T,) pixels
     stability: NDArray[np.int8]  # (T,) codes of `sivo.labeling.stability`
     segment: Int64  # (T,)
+    parallax_deg: Float32  # (T,)
+    withheld: NDArray[np.bool_]  # (T,) the second opinion took its label away
 
     def __len__(self) -> int:
         return len(self.track)
@@ -216,6 +222,8 @@ def read_points(path: Path) -> PointsTable:
         table["max_error"].to_numpy(),
         codes,
         table["segment"].to_numpy().astype(np.int64),
+        table["parallax"].to_numpy(),
+        table["withheld"].to_numpy().astype(np.bool_),
     )
 
 
