@@ -8,6 +8,7 @@ import importlib
 from sivo.cli.options import add_config_arguments
 
 SETTINGS = {  # command -> its settings
+    "label": "sivo.odometry.run_settings:RunSettings",
     "run": "sivo.odometry.run_settings:RunSettings",
     "evaluate-pose": "sivo.evaluation.settings:PoseCommandSettings",
     "evaluate-trajectory": "sivo.evaluation.settings:TrajectoryCommandSettings",

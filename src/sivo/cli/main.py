@@ -15,6 +15,7 @@ from sivo.errors import SivoError
 # verb -> (module under sivo.cli, help line). A module has `add_arguments(parser)` and `run(arguments) -> int | None`;
 # a verb with its own sub-commands adds them with `parser.add_subparsers`. Heavy imports belong inside `run`.
 COMMANDS: dict[str, tuple[str, str]] = {
+    "label": ("label", "stability labels for many sequences: odometry, then the paper's rule"),
     "run": ("run", "visual odometry on one sequence: trajectory, map, tracks"),
     "evaluate": ("evaluate", "how good a frontend or a trajectory is: the paper's protocols"),
     "train": ("train", "teach the network: drawn shapes, homographies"),

@@ -185,6 +185,12 @@ class PointsTable:
     def __len__(self) -> int:
         return len(self.track)
 
+    def counts(self) -> dict[str, int]:
+        """Number of tracks per label, and of labels withheld."""
+        by_code = np.bincount(self.stability, minlength=len(STABILITY_NAMES))
+        names = {name: int(by_code[code]) for code, name in enumerate(STABILITY_NAMES)}
+        return {**names, "withheld": int(self.withheld.sum())}
+
 
 @dataclass(frozen=True)
 class TracksTable:

@@ -1,0 +1,94 @@
+"""`sivo label SEQUENCE... -o LABELS`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from sivo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from sivo.odometry.run_settings import RunSettings
+
+_FLAGS = {"frontend": "frontend.name", "max_keypoints": "frontend.max_keypoints", "seed": "odometry.seed"}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `sivo label`."""
+    defaults = RunSettings()
+    parser.add_argument(
+        "sequences", type=Path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
+    )
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="LABELS", help="folder of the label store")
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help="sequences at a time, a process for each")
+    parser.add_argument("--pack", action="store_true", help="keep the frames beside the labels, to train elsewhere")
+    parser.add_argument(
+        "--relabel", action="store_true", help="where LABELS was made with other settings, label all of it anew"
+    )
+    parser.add_argument(
+        "--frontend",
+        default=argparse.SUPPRESS,
+        metavar="NAME",
+        help=f"as of `sivo run` ({defaults.frontend.name})",
+    )
+    parser.add_argument(
+        "--max-keypoints",
+        type=int,
+        default=argparse.SUPPRESS,
+        metavar="N",
+        help=f"per frame (default: {defaults.frontend.max_keypoints})",
+    )
+    parser.add_argument("--seed", type=int, default=argparse.SUPPRESS, help="of all random choices (default: 0)")
+    add_sequence_arguments(parser)
+    add_config_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Label what is not labelled yet; 0 unless nothing could be."""
+    settings = settings_from(RunSettings, arguments, _FLAGS)
+    from tqdm import tqdm
+
+    from sivo.backend.compile import compile_kernels
+    from sivo.improvement.labelling import label_sequences
+    from sivo.labeling.store import DONE, SequenceRecord
+
+    compile_kernels(lambda words: print(words, file=sys.stderr))
+    total = len(arguments.sequences)
+    finished = 0
+    with tqdm(unit="frame", desc=f"label 0/{total}", smoothing=0.1, delay=0.5) as bar:
+
+        def on_record(record: SequenceRecord) -> None:
+            nonlocal finished
+            finished += 1
+            bar.set_description(f"label {finished}/{total}")
+            with tqdm.external_write_mode():
+                print(_line(record))
+
+        def on_frames(count: int) -> None:
+            bar.update(count)
+
+        records = label_sequences(
+            arguments.sequences,
+            arguments.output,
+            settings,
+            workers=arguments.workers,
+            pack=arguments.pack,
+            relabel=arguments.relabel,
+            on_record=on_record,
+            on_frames=on_frames,
+        )
+    done = [record for record in records if record.state == DONE]
+    stable, unstable = sum(r.stable for r in done), sum(r.unstable for r in done)
+    print(f"{len(done)} of {len(records)} sequences labelled: {stable} stable and {unstable} unstable tracks")
+    print(f"labels in {arguments.output}")
+    return 0
+
+
+def _line(record: object) -> str:
+    from sivo.labeling.store import DONE, SequenceRecord
+
+    assert isinstance(record, SequenceRecord)
+    if record.state != DONE:
+        return f"{record.name}: not labelled: {record.reason}"
+    poses = f"{record.tracked} of {record.frames} frames with a pose"
+    labels = f"{record.stable} stable, {record.unstable} unstable, {record.ignore} ignored tracks"
+    return f"{record.name}: {poses}; {labels}" + (f", {record.withheld} withheld" if record.withheld else "")
