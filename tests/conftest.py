@@ -16,3 +16,16 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("needs the real sequences in ../shared/data, which are not part of the project")
     return folder
+
+
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output folder of a real `sivo run` over 30 pictures of a textured room; not to be written to."""
+    from rendered_walk import write_walk
+
+    from sivo.cli.main import main
+
+    folder = tmp_path_factory.mktemp("finished")
+    walk = write_walk(folder / "walk", frames=30)
+    assert main(["run", str(walk), "-o", str(folder / "out"), "--frontend", "orb", "--max-keypoints", "400"]) == 0
+    return folder / "out"

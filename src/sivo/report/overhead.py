@@ -8,7 +8,7 @@ import numpy as np
 
 from sivo.types import Float64
 
-_LEVEL_PRIOR = 0.02  # how strongly "cameras are held upright" counts against "cameras are held level"
+_LEVEL_PRIOR = 0.005  # how strongly "cameras are held upright" counts against "cameras are held level"
 
 
 @dataclass(frozen=True)

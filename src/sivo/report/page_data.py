@@ -73,9 +73,13 @@ def frames_data(
         width: of the pictures in pixels.
         old: age in frames of the last colour.
         large_error: pixels, of the last colour.
+
+    Raises:
+        InputError: the recording is not there any more.
     """
     import cv2
 
+    assert len(run.sequence) > 0  # opened here, so that a recording that is gone is an error and not no frames
     frames, brightness = [], []
     for position in positions:
         try:

@@ -1,0 +1,146 @@
+"""Other tools open what is exported, and see the same geometry."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sivo.cli.main import main
+from sivo.report.model import segment_model
+from sivo.report.run_folder import RunFolder, read_map
+from sivo.report.trajectory_export import export_trajectory
+from sivo.sequences import open_sequence, read_trajectory
+from sivo.types import Trajectory
+
+
+def test_map_is_read_back_as_it_was_written(finished_run: Path) -> None:
+    run = RunFolder(finished_run)
+    assert len(run.map) == run.report["points"] > 100
+    assert (run.map.observations >= 2).all()
+    assert np.isfinite(run.map.mean_error).all()
+    depth = run.map.xyz[:, 2]
+    assert 0.3 < np.median(depth) < 5, "the map is scaled to an initial median depth of 1"
+
+
+def test_a_damaged_map_is_named(finished_run: Path, tmp_path: Path) -> None:
+    from sivo.errors import InputError
+
+    content = (finished_run / "map.ply").read_bytes()
+    for number, damaged in enumerate((b"", b"ply\n", content[:-7], content.replace(b"mean_error", b"other_name"))):
+        path = tmp_path / f"{number}.ply"
+        path.write_bytes(damaged)
+        with pytest.raises(InputError, match=rf"{number}\.ply"):
+            read_map(path)
+
+
+def test_model_errors_are_those_of_the_table(finished_run: Path) -> None:
+    run = RunFolder(finished_run)
+    model = segment_model(run, 0, max_error=np.inf, min_observations=2)
+    assert len(model.error) > 1000
+    known = np.isfinite(run.tracks.error)
+    lengths = np.bincount(run.tracks.track[known], minlength=run.tracks.track.max() + 1)
+    kept = known & (lengths[run.tracks.track] >= 2)
+    assert len(model.error) <= kept.sum()
+    table = np.sort(run.tracks.error[kept])
+    # every observation in front of its camera is there, with the error that the run wrote
+    np.testing.assert_allclose(np.sort(model.error)[:1000], table[:1000], rtol=1e-4, atol=1e-5)
+
+
+def test_pycolmap_opens_the_model_and_agrees_on_the_errors(finished_run: Path, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sivo[dev]'")
+    assert main(["export", "colmap", str(finished_run), "-o", str(tmp_path / "colmap")]) == 0
+    run = RunFolder(finished_run)
+    model = segment_model(run, 0)
+    opened = pycolmap.Reconstruction(str(tmp_path / "colmap" / "sparse" / "0"))
+    assert opened.num_images() == 30 == len(list((tmp_path / "colmap" / "images").iterdir()))
+    assert opened.num_points3D() == len(model.xyz) > 100
+    assert opened.compute_num_observations() == len(model.error)
+    assert opened.compute_mean_reprojection_error() == pytest.approx(model.mean_error, abs=1e-9)
+    opened.update_point_3d_errors()  # its own projection of our points into our poses
+    assert opened.compute_mean_reprojection_error() == pytest.approx(model.mean_error, abs=1e-6)
+
+
+def test_nerfstudio_scene_is_read_back_with_the_same_camera_and_poses(finished_run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "scene"
+    assert main(["export", "nerfstudio", str(finished_run), "-o", str(folder)]) == 0
+    run = RunFolder(finished_run)
+    sequence = open_sequence(folder, format="nerfstudio")
+    np.testing.assert_allclose(sequence.camera.K, run.camera.K, atol=1e-9)
+    assert sequence.ground_truth is not None
+    np.testing.assert_allclose(sequence.ground_truth.world_from_cam, run.trajectory.world_from_cam, atol=1e-9)
+    np.testing.assert_array_equal(sequence[7].image, run.image(7))
+    header = (folder / "sparse_pc.ply").read_bytes().split(b"end_header")[0].decode()
+    assert "property uchar red" in header
+
+
+def test_images_of_an_export_are_the_frames(finished_run: Path, tmp_path: Path) -> None:
+    assert main(["export", "colmap", str(finished_run), "-o", str(tmp_path / "c")]) == 0
+    picture = cv2.imread(str(tmp_path / "c" / "images" / "frame_000004.png"), cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(picture, RunFolder(finished_run).image(4))
+
+
+@pytest.mark.parametrize("format", ["tum", "kitti", "euroc"])
+def test_trajectory_files_are_read_back(finished_run: Path, tmp_path: Path, format: str) -> None:
+    path = tmp_path / {"tum": "t.txt", "kitti": "k.txt", "euroc": "data.csv"}[format]
+    assert main(["export", "trajectory", str(finished_run), "-o", str(path), "--format", format]) == 0
+    ours, read = RunFolder(finished_run).trajectory, read_trajectory(path, format)
+    np.testing.assert_allclose(read.world_from_cam, ours.world_from_cam, atol=1e-8)
+    if format != "kitti":
+        np.testing.assert_allclose(read.times, ours.times, atol=1e-8)
+
+
+def test_kitti_refuses_a_trajectory_with_gaps(tmp_path: Path) -> None:
+    from sivo.errors import InputError
+
+    gappy = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
+    with pytest.raises(InputError, match="2 have no pose; use tum or euroc"):
+        export_trajectory(gappy, 5, tmp_path / "k.txt", "kitti")
+    assert not (tmp_path / "k.txt").exists()
+
+
+def verified(path: Path) -> str:
+    """The statistics of Rerun's own tool, which must find no error."""
+    run = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", "verify", str(path)], capture_output=True, text=True, timeout=120
+    )
+    assert run.returncode == 0, run.stderr
+    statistics = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", "stats", str(path)], capture_output=True, text=True, timeout=120
+    )
+    return statistics.stdout
+
+
+def test_finished_run_is_recorded_for_rerun_without_a_screen(finished_run: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="needs Rerun: pip install 'sivo[view]'")
+    assert main(["show", "live", str(finished_run), "--save", str(tmp_path / "run.rrd")]) == 0
+    text = verified(tmp_path / "run.rrd")
+    for entity in ("/world/camera/image", "/world/labels", "/world/points", "/world/trajectory", "/plots/tracks"):
+        assert entity in text
+
+
+def test_run_is_recorded_while_it_goes_on(finished_run: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="needs Rerun: pip install 'sivo[view]'")
+    walk, recording = finished_run.parent / "walk", tmp_path / "live.rrd"
+    words = ["run", str(walk), "-o", str(tmp_path / "out"), "--frontend", "orb", "--max-frames", "20"]
+    assert main([*words, "--save", str(recording)]) == 0
+    text = verified(recording)
+    rows = re.search(r"num_rows = (\d+)", text)
+    assert rows is not None
+    assert int(rows[1]) >= 20 * 5, "picture, keypoints and three curves for every frame"
+    assert "/world/camera/image/keypoints" in text
+    assert "/world/observed" in text
+    assert "/world/trajectory" in text
+
+
+def test_viewer_without_rerun_names_the_extra(
+    finished_run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert main(["show", "live", str(finished_run)]) == 2
+    assert "pip install 'sivo[view]'" in capsys.readouterr().err

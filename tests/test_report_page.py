@@ -1,0 +1,206 @@
+"""The pages are one file, load in a real browser without errors, and answer to slider and mouse."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sivo.cli.main import main
+from sivo.report.charts import line_chart
+from sivo.report.page import Page
+from sivo.report.plain_words import ranges, warnings
+
+CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+
+
+@pytest.fixture(scope="module")
+def page(finished_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of a run."""
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    assert main(["report", str(finished_run), "-o", str(path)]) == 0
+    return path
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Any]:
+    """Headless Chromium."""
+    if CHROMIUM is None or DRIVER is None:
+        pytest.skip("needs Chromium and ChromeDriver on the PATH (Debian: chromium, chromium-driver)")
+    webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium: pip install 'sivo[dev]'")
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path / 'profile'}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    yield driver
+    driver.quit()
+
+
+def until(condition: Any, seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "the page did not answer"
+        time.sleep(0.05)
+
+
+def test_page_is_one_file_without_network(page: Path) -> None:
+    text = page.read_text()
+    markup = re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
+    assert not re.findall(r"(?:src|href)=\"(?!data:)[^\"]*\"", markup)
+    assert "http://" not in text
+    assert "https://" not in text
+    assert page.stat().st_size < 3e6
+
+
+def test_browser_loads_it_without_errors_and_slider_and_map_respond(page: Path, browser: Any) -> None:
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.keys import Keys
+
+    browser.get(page.as_uri())
+    frame, scene = browser.find_element("id", "frame"), browser.find_element("id", "scene")
+    until(lambda: frame.get_attribute("data-frame") is not None)
+    first, camera = frame.get_attribute("data-frame"), scene.get_attribute("data-camera")
+
+    slider = browser.find_element("id", "frame-slider")
+    slider.send_keys(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT)
+    until(lambda: int(frame.get_attribute("data-frame")) == int(first) + 3)
+    until(lambda: int(scene.get_attribute("data-camera")) == int(camera) + 3)  # the map follows the frame
+
+    def pixels() -> str:
+        return str(browser.execute_script("return document.getElementById('frame').toDataURL()"))
+
+    with_tracks = pixels()
+    browser.find_element("css selector", "input[name=overlay][value=labels]").click()
+    until(lambda: frame.get_attribute("data-overlay") == "labels")
+    assert pixels() != with_tracks
+
+    yaw = scene.get_attribute("data-yaw")
+    ActionChains(browser).move_to_element(scene).click_and_hold().move_by_offset(60, 10).release().perform()
+    until(lambda: scene.get_attribute("data-yaw") != yaw)
+    browser.find_element("css selector", "input[name=layer][value=labels]").click()
+    until(lambda: scene.get_attribute("data-layer") == "labels")
+    distance = scene.get_attribute("data-distance")
+    scene.send_keys("+")
+    until(lambda: float(scene.get_attribute("data-distance")) < float(distance))
+    lit = browser.execute_script(
+        "const c=document.getElementById('scene'), d=c.getContext('2d').getImageData(0,0,c.width,c.height).data;"
+        "let n=0; for (let i=0;i<d.length;i+=4) if (Math.max(d[i],d[i+1],d[i+2])>120) n++; return n"
+    )
+    assert lit > 300, "the map is empty"
+    assert browser.get_log("browser") == []
+
+
+def test_it_fits_a_phone(page: Path, browser: Any) -> None:
+    size = {"width": 390, "height": 800, "deviceScaleFactor": 2, "mobile": True}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    browser.get(page.as_uri())
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
+
+
+def test_report_without_its_recording_says_so(finished_run: Path, tmp_path: Path) -> None:
+    run = tmp_path / "out"
+    shutil.copytree(finished_run, run)
+    report = run / "run.json"
+    report.write_text(report.read_text().replace(str(finished_run.parent / "walk"), str(tmp_path / "gone")))
+    assert main(["report", str(run)]) == 0
+    text = (run / "report.html").read_text()
+    assert "not there any more" in text
+    assert 'id="frame-slider"' not in text
+    assert 'id="scene"' in text
+
+
+def test_text_of_others_is_escaped(tmp_path: Path) -> None:
+    page = Page("<script>alert(1)</script>", "a & b")
+    page.table(["<b>", "x"], [["**1**", "</td>"]])
+    page.script("scene.js", "some-data", {"name": "</script><img>"})
+    page.write(tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text()
+    assert "<script>alert" not in text
+    assert "</script><img>" not in text
+    assert "<b>1</b>" in text
+    data = re.search(r'id="some-data">(.*?)</script>', text)
+    assert data is not None
+    assert json.loads(data[1]) == {"name": "</script><img>"}
+
+
+def report(**changes: Any) -> dict[str, Any]:
+    result: dict[str, Any] = {
+        "interrupted": False,
+        "frames": {"processed": 10, "tracked": 10, "lost": 0, "lost_frames": []},
+        "segments": [{"first": 0}],
+        "events": [],
+        "input": {"skipped": [], "notes": []},
+    }
+    return result | changes
+
+
+def words(content: dict[str, Any], brightness: float = 120.0, error: float = 0.4) -> str:
+    return " ".join(warnings(content, np.arange(3), np.array([brightness, 120, 120]), error))
+
+
+def test_a_good_run_has_no_warnings() -> None:
+    assert words(report()) == ""
+
+
+def test_what_is_wrong_is_said_in_plain_words() -> None:
+    lost = {"processed": 10, "tracked": 7, "lost": 3, "lost_frames": [4, 5, 6]}
+    event = {"position": 4, "kind": "lost", "detail": "only 3 points of the map found"}
+    text = words(report(frames=lost, events=[event]))
+    assert "Lost at frame 4" in text
+    assert "3 of 10 frames have no pose: 4-6" in text
+    none = {"processed": 10, "tracked": 0, "lost": 10, "lost_frames": list(range(10))}
+    waiting = {"position": 2, "kind": "waiting", "detail": "too little parallax"}
+    assert "too little parallax" in words(report(frames=none, events=[waiting]))
+    assert "Dark frames (mean grey value under 25 of 255): 0" in words(report(), brightness=9.0)
+    assert "2 pieces" in words(report(segments=[{"first": 0}, {"first": 6}]))
+    assert "Check the calibration" in words(report(), error=2.5)
+    skipped = [{"index": 3, "source": "a.png", "reason": "truncated"}]
+    assert "a.png: truncated" in words(report(input={"skipped": skipped, "notes": []}))
+
+
+def test_ranges_are_short() -> None:
+    assert ranges([1, 2, 3, 7, 9, 10]) == "1-3, 7, 9-10"
+    assert ranges(list(range(0, 40, 2))).endswith("and 12 more stretches")
+
+
+def test_chart_leaves_gaps_where_there_is_nothing() -> None:
+    x = np.arange(10.0)
+    y = np.where((x == 4) | (x == 5), np.nan, x)
+    svg = line_chart(x, y, "a < b")
+    assert svg.count("<polyline") == 2
+    assert "a &lt; b" in svg
+    assert line_chart(x, np.full(10, np.nan), "nothing").count("<polyline") == 0
+
+
+def test_an_evaluation_page_has_its_tables_and_meaning(tmp_path: Path) -> None:
+    (tmp_path / "vo.json").write_text('{"rows": [1]}')
+    (tmp_path / "vo.md").write_text("# Table\n\n| a | b |\n|---|--:|\n| sift | **.5** |\n")
+    assert main(["report", str(tmp_path)]) == 0
+    text = (tmp_path / "report.html").read_text()
+    assert "<td><b>.5</b></td>" in text
+    assert "with and without stability" in text
+
+
+def test_a_folder_without_results_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", str(tmp_path)]) == 2
+    assert "has no results" in capsys.readouterr().err
+    assert not (tmp_path / "report.html").exists()

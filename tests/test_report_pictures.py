@@ -1,0 +1,175 @@
+"""The pictures show what their captions say."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sivo.cli.main import main
+from sivo.geometry.se3 import rigid, so3_exp
+from sivo.labeling.stability import STABLE
+from sivo.report.canvas import Canvas
+from sivo.report.overhead import overhead_axes, robust_limits
+from sivo.report.palettes import PALETTES
+from sivo.report.run_folder import RunFolder
+from sivo.report.sheets import write_video
+from sivo.report.stability_picture import suppressed_regions
+from sivo.report.track_pictures import TrackPictureSettings, paint_labels, paint_tracks
+from sivo.types import Float64
+
+
+def read(path: Path) -> np.ndarray:
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    return picture[..., ::-1]
+
+
+def looking_down(yaw_deg: Float64, pitch_deg: float) -> Float64:
+    """(N, 4, 4) level cameras in a world whose z is up, turned by yaw and looking down by pitch."""
+    upright = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # camera x = right, y = down, z = ahead (world y)
+    yaw = so3_exp(np.radians(yaw_deg)[:, None] * np.array([0.0, 0, 1]))
+    pitch = so3_exp(np.radians(-pitch_deg) * np.array([1.0, 0, 0]))
+    return rigid(yaw @ upright @ pitch, np.zeros((len(yaw_deg), 3)))
+
+
+@pytest.mark.parametrize("pitch_deg", [0.0, 40.0, 75.0])
+def test_down_is_found_however_far_the_camera_looks_down(pitch_deg: float) -> None:
+    axes = overhead_axes(looking_down(np.linspace(-60, 60, 20), pitch_deg))
+    assert axes.down @ [0, 0, -1] > np.cos(np.radians(4.0))
+    assert axes.forward @ axes.down == pytest.approx(0, abs=1e-9)
+    np.testing.assert_allclose(np.cross(axes.right, axes.forward), -axes.down, atol=1e-9)
+
+
+def test_ahead_of_the_first_camera_is_up_in_the_picture_and_its_right_is_right() -> None:
+    axes = overhead_axes(np.eye(4)[None])
+    np.testing.assert_allclose(axes.project(np.array([[0.0, 0, 3], [2.0, 0, 0]])), [[0, 3], [2, 0]], atol=1e-9)
+
+
+def test_a_few_far_points_do_not_shrink_the_map() -> None:
+    rng = np.random.default_rng(0)
+    path = np.linspace([0, 0], [4, 0], 50)
+    points = np.concatenate([rng.uniform(-3, 6, (1000, 2)), [[1e4, 0], [0, -1e5]]])
+    low, high = robust_limits(path, points)
+    assert (low < path.min(axis=0)).all()
+    assert (high > path.max(axis=0)).all()
+    assert (high - low).max() < 15
+    inside = ((points > low) & (points < high)).all(axis=1)
+    assert inside.mean() > 0.85
+
+
+def test_map_has_white_points_a_jet_trajectory_and_a_black_last_window(finished_run: Path, tmp_path: Path) -> None:
+    assert main(["show", "map", str(finished_run), "-o", str(tmp_path / "map.png"), "--last", "8"]) == 0
+    picture = read(tmp_path / "map.png").astype(int)
+    drawn = picture[:, : int(0.85 * picture.shape[1])]  # without the legend's ramp
+    red, green, blue = drawn[..., 0], drawn[..., 1], drawn[..., 2]
+    assert ((blue > 180) & (red < 60) & (green < 120)).sum() > 50, "no blue beginning"
+    assert ((green > 180) & (blue > 60) & (red < 200) & (abs(red - green) > 40)).sum() > 20, "no middle of the ramp"
+    assert (drawn.max(axis=-1) < 40).sum() > 100, "no black last window"
+    assert ((drawn.min(axis=-1) > 200)[100:-100]).sum() > 500, "no white points"
+
+
+@pytest.mark.parametrize("scale_to", [64, 256])
+def test_dots_stand_on_the_centre_of_their_pixel(scale_to: int) -> None:
+    canvas = Canvas(np.zeros((48, 64), np.uint8), width=scale_to)
+    canvas.dots(np.array([[10.0, 20.0]]), np.array([[255, 0, 0]], np.uint8), radius=2.0)
+    rows, columns = np.nonzero(canvas.rgb[..., 0] > 100)
+    centre = np.array([columns.mean(), rows.mean()])
+    np.testing.assert_allclose((centre + 0.5) / canvas.scale - 0.5, [10.0, 20.0], atol=0.15)
+
+
+@pytest.mark.parametrize("name", ["paper", "colour-blind"])
+def test_stable_points_have_their_colour(finished_run: Path, name: str) -> None:
+    run, colours = RunFolder(finished_run), PALETTES[name]
+    picture = paint_labels(run, 15, TrackPictureSettings(palette=colours, width=run.camera.width))
+    seen = run.observations(15)
+    stable = seen.keypoints[seen.stability == STABLE]
+    assert len(stable) > 20
+    u, v = np.rint(stable).astype(int).T
+    distance = np.abs(picture[v, u].astype(int) - np.array(colours.stable)).max(axis=1)
+    assert (distance < 60).mean() > 0.8
+
+
+def test_old_tracks_have_another_colour_than_new_ones(finished_run: Path) -> None:
+    run = RunFolder(finished_run)
+    picture = paint_tracks(run, 25, TrackPictureSettings(old=10, width=run.camera.width)).astype(int)
+    seen = run.observations(25)
+    assert (seen.age >= 10).sum() > 10
+    old = np.rint(seen.keypoints[seen.age >= 10]).astype(int)
+    new = np.rint(seen.keypoints[seen.age == 0]).astype(int)
+    redness = picture[..., 0] - picture[..., 2]
+    assert np.median(redness[old[:, 1], old[:, 0]]) > 60
+    assert np.median(redness[new[:, 1], new[:, 0]]) < 0
+
+
+def test_sheet_files_and_video_have_the_frames_asked_for(finished_run: Path, tmp_path: Path) -> None:
+    show = ["show", "residuals", str(finished_run)]
+    assert main([*show, "-o", str(tmp_path / "two.png"), "--frames", "3,20"]) == 0
+    assert main([*show, "-o", str(tmp_path / "one.png"), "--frames", "1"]) == 0
+    one, two = read(tmp_path / "one.png"), read(tmp_path / "two.png")
+    assert two.size > 1.9 * one.size
+    assert main([*show, "-o", str(tmp_path), "--frames", "3,20", "--each"]) == 0
+    assert {p.name for p in (tmp_path / "residuals").iterdir()} == {"residuals_000003.png", "residuals_000020.png"}
+    assert main([*show, "-o", str(tmp_path / "all.mp4"), "--frames", "0,1,2,3,4", "--video"]) == 0
+    video = cv2.VideoCapture(str(tmp_path / "all.mp4"))
+    read_back = 0
+    while video.read()[0]:
+        read_back += 1
+    assert read_back == 5
+
+
+def test_video_keeps_its_colours(tmp_path: Path) -> None:
+    red = np.zeros((64, 96, 3), np.uint8)
+    red[..., 0] = 220
+    write_video(tmp_path / "red.mp4", [red] * 4, fps=10)
+    ok, frame = cv2.VideoCapture(str(tmp_path / "red.mp4")).read()
+    assert ok
+    np.testing.assert_allclose(frame.reshape(-1, 3).mean(axis=0), [0, 0, 220], atol=25)
+
+
+def test_a_recording_that_moved_is_named_with_its_mend(
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "out"
+    shutil.copytree(finished_run, run)
+    report = run / "run.json"
+    report.write_text(report.read_text().replace(str(finished_run.parent / "walk"), str(tmp_path / "gone")))
+    assert main(["show", "tracks", str(run)]) == 2
+    assert "--sequence" in capsys.readouterr().err
+    moved = ["--sequence", str(finished_run.parent / "walk"), "--frames", "1"]
+    assert main(["show", "tracks", str(run), *moved]) == 0
+    assert (run / "pictures" / "tracks.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["map", "nowhere"], "no such folder"),
+        (["labels", "RUN", "--frames", "3,99"], "there is no frame 99"),
+        (["labels", "RUN", "--frames", "many"], "--frames many"),
+        (["map", "RUN", "-o", "no/such/place.png"], "no folder"),
+        (["accuracy", "RUN"], "pose.json"),
+        (["stability", "RUN"], "no stability head"),
+    ],
+)
+def test_bad_requests_are_one_line_with_the_mend(
+    finished_run: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    capsys.readouterr()
+    assert main(["show", *(str(finished_run) if word == "RUN" else word for word in words)]) == 2
+    message = capsys.readouterr().err.strip().splitlines()
+    assert len(message) == 1
+    assert said in message[0]
+
+
+def test_suppressed_regions_are_where_most_suppressed_points_are() -> None:
+    rng = np.random.default_rng(0)
+    cluster = rng.normal([50, 40], 5, (12, 2))
+    alone = np.array([[150.0, 20.0], [20.0, 110.0]])
+    centres, radii = suppressed_regions(np.concatenate([alone, cluster]).astype(np.float32), (120, 160))
+    assert len(centres) == 1
+    assert np.linalg.norm(centres[0] - [50, 40]) < 5
+    assert (np.linalg.norm(cluster - centres[0], axis=1) < radii[0]).all()
