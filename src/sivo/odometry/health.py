@@ -21,7 +21,6 @@ from sivo.odometry.view import View
 from sivo.tracking.matching import match_units
 from sivo.types import Float64
 
-
 _FEATURES = 600  # the strongest of each view; all of them would only cost time
 
 

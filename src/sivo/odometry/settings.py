@@ -21,14 +21,16 @@ class MatchingSettings:
 class StartSettings:
     """When two views are good enough to start a map (robust mode)."""
 
-    min_common_tracks: int = 60
+    min_common_tracks: int = 30  # of the earliest view that the newest still overlaps
+    min_matches: int = 60  # between the two, matched afresh
+    min_rotation_residual: float = 2.0  # pixels, median that the best pure rotation leaves of the matches
     max_waiting: int = 300  # frames kept while waiting for enough parallax
     epipolar_error: float = 1.0  # pixels, RANSAC threshold of the essential matrix and of the homography
     max_homography_ratio: float = 0.7  # homography inliers / essential inliers; more is too little parallax
     plane_ratio: float = 0.95  # from here on the scene is a plane, and its homography is decomposed
     min_parallax_deg: float = 1.0
     min_points: int = 30  # over the minimum parallax
-    min_inlier_share: float = 0.5  # essential inliers of the matches
+    min_inlier_share: float = 0.3  # essential inliers of the matches
     max_mean_error: float = 1.2  # pixels, after adjustment and pruning
     max_lost_share: float = 0.2  # of the waiting frames, such as black ones, may stay without a pose
 

@@ -16,6 +16,7 @@ from sivo.odometry.local_map import LocalMap, poselib_camera
 from sivo.odometry.settings import OdometrySettings, StartSettings
 from sivo.odometry.view import NO_POINT, View, common_tracks
 from sivo.odometry.window import adjust
+from sivo.tracking.matching import match_units
 from sivo.types import Float64, Int64
 
 
@@ -38,15 +39,18 @@ class Refusal:
     costly: bool = False  # found only after much work: better not tried again with the very next frame
 
 
-def two_view_geometry(a: View, b: View, camera: Camera, settings: StartSettings, seed: int) -> TwoView | Refusal:
-    """Relative pose of two views by the five-point algorithm, gated by a homography.
+def two_view_geometry(
+    a: View, b: View, camera: Camera, settings: StartSettings, descriptor_distance: float, seed: int
+) -> TwoView | Refusal:
+    """Relative pose of two views by the five-point algorithm, gated by a rotation and by a homography.
 
-    A pure rotation or too small a motion is explained by a homography about as well as by an essential matrix; then
-    the translation and with it all depths would be noise.
+    Where a pure rotation explains the matches, or a homography does about as well as an essential matrix, the
+    translation and with it all depths would be noise.
     """
-    rows_a, rows_b = common_tracks(a, b)
-    if len(rows_a) < settings.min_common_tracks:
-        return Refusal("too few tracks")
+    matches = match_units(a.descriptors, b.descriptors, descriptor_distance)
+    rows_a, rows_b = matches[:, 0], matches[:, 1]
+    if len(rows_a) < settings.min_matches:
+        return Refusal("too few matches")
     pixels_a, pixels_b = a.keypoints[rows_a], b.keypoints[rows_b]
     options = {
         "max_epipolar_error": settings.epipolar_error,
@@ -59,14 +63,32 @@ def two_view_geometry(a: View, b: View, camera: Camera, settings: StartSettings,
     pose, essential = poselib.estimate_relative_pose(pixels_a, pixels_b, shape, shape, options)
     homography, planar = poselib.estimate_homography(pixels_a, pixels_b, options)
     inliers = np.asarray(essential["inliers"], bool)
-    if inliers.sum() < settings.min_inlier_share * len(rows_a):
-        return Refusal("tracks disagree")
+    if inliers.sum() < max(settings.min_inlier_share * len(rows_a), settings.min_points):
+        return Refusal("too few matches agree on a motion")
+    if np.median(rotation_residuals(camera, pixels_a[inliers], pixels_b[inliers])) < settings.min_rotation_residual:
+        return Refusal("too little parallax: a rotation explains the motion")
     ratio = np.sum(planar["inliers"]) / max(inliers.sum(), 1)
     if ratio >= settings.plane_ratio:
         return _from_plane(a, b, rows_a, rows_b, homography, np.asarray(planar["inliers"], bool), camera, settings)
     if ratio > settings.max_homography_ratio:
         return Refusal("too little parallax")
     return _points_of(a, b, rows_a[inliers], rows_b[inliers], se3.rigid(pose.R, pose.t), camera, settings)
+
+
+def rotation_residuals(camera: Camera, pixels_a: Float64, pixels_b: Float64) -> Float64:
+    """Pixels (N,) that the best pure rotation of the camera leaves unexplained; robust to moderate outliers."""
+    rays_a, rays_b = camera.unproject(pixels_a), camera.unproject(pixels_b)
+    rays_a /= np.linalg.norm(rays_a, axis=1, keepdims=True)
+    rays_b /= np.linalg.norm(rays_b, axis=1, keepdims=True)
+    weights = np.ones(len(rays_a))
+    residuals = weights
+    for _ in range(8):
+        b_from_a = se3.nearest_rotation((rays_b * weights[:, None]).T @ rays_a)
+        turned = rays_a @ b_from_a.T
+        turned[:, 2] = np.maximum(turned[:, 2], 1e-3)
+        residuals = np.linalg.norm(camera.project(turned) - pixels_b, axis=1)
+        weights = 1.0 / np.maximum(residuals, 1.0)
+    return residuals
 
 
 def _points_of(
@@ -133,7 +155,7 @@ def start_map(
     a = next((v for v in waiting[:-1] if len(common_tracks(v, b)[0]) >= start.min_common_tracks), None)
     if a is None:
         return Refusal("too few tracks")
-    pair = two_view_geometry(a, b, camera, start, settings.seed)
+    pair = two_view_geometry(a, b, camera, start, descriptor_distance, settings.seed)
     if isinstance(pair, Refusal):
         return pair
     local_map = LocalMap(camera, settings, descriptor_distance)
