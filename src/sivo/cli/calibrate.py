@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("auto", "brown4", "brown5", "brown8", "fisheye"),
         help="distortion; auto takes the simplest that explains the corners",
     )
-    parser.add_argument("--samples", type=int, default=200, metavar="N", help="frames to search for the board")
+    parser.add_argument("--samples", type=int, default=120, metavar="N", help="frames to search for the board")
     parser.add_argument("--views", type=int, default=40, metavar="N", help="boards to use at most")
     parser.add_argument("--format", default="auto", help="of the recording")
     parser.add_argument("--topic", metavar="NAME", help="image topic of a ROS bag")
@@ -47,9 +47,7 @@ def run(arguments: argparse.Namespace) -> None:
     board = parse_board(arguments.board)
     if arguments.print_board is not None:
         print_board(board, arguments.print_board, arguments.paper)
-        print(
-            f"{arguments.print_board}: print it at 100 % (no fitting to the page), check the ruler, glue it to something flat"
-        )
+        print(f"{arguments.print_board}: print it at 100 %, check the ruler, glue it to something flat")
         return
     if arguments.recording is None:
         raise ConfigError("give a recording of the board, or --print-board FILE.pdf to make one")

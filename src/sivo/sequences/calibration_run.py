@@ -22,7 +22,7 @@ def calibrate(
     recording: Recording,
     board: Board,
     model: str = "auto",
-    samples: int = 200,
+    samples: int = 120,
     views: int = 40,
     progress: Callable[[bool], object] = lambda _: None,
 ) -> CameraFit:

@@ -222,8 +222,8 @@ def _refuse_undetermined(fit: _Solved) -> None:
         )
     if fit.tilt < MIN_TILT:
         raise InputError(
-            f"the board was always parallel to the picture (tilted by {fit.tilt:.0f} degrees at most), which leaves the "
-            "focal length open; tilt it by 20 to 45 degrees to all sides"
+            f"the board was always parallel to the picture (tilted by {fit.tilt:.0f} degrees at most), which leaves "
+            "the focal length open; tilt it by 20 to 45 degrees to all sides"
         )
     deviation = max(fit.deviations["fx"] / fit.camera.fx, fit.deviations["fy"] / fit.camera.fy)
     if deviation > MAX_FOCAL_DEVIATION:
