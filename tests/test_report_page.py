@@ -204,3 +204,19 @@ def test_a_folder_without_results_is_refused(tmp_path: Path, capsys: pytest.Capt
     assert main(["report", str(tmp_path)]) == 2
     assert "has no results" in capsys.readouterr().err
     assert not (tmp_path / "report.html").exists()
+
+
+def test_a_label_store_has_a_page_with_what_failed_and_why(finished_run: Path, tmp_path: Path) -> None:
+    walk, still = finished_run.parent / "walk", tmp_path / "still"
+    still.mkdir()
+    for number in range(12):
+        shutil.copy(walk / "000000.png", still / f"{number:06d}.png")
+    shutil.copy(walk / "camera.yaml", still)
+    labels = tmp_path / "labels"
+    main(["label", str(walk), str(still), "-o", str(labels), "--frontend", "orb", "--max-keypoints", "400"])
+    assert main(["report", str(labels)]) == 0
+    text = (labels / "report.html").read_text()
+    assert "1 of 2" in text
+    assert "still has no labels" in text
+    assert text.count("data:image/png") == 1
+    assert main(["report", str(labels / "walk"), "-o", str(tmp_path / "one.html")]) == 0

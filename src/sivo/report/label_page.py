@@ -1,14 +1,15 @@
-"""`report.html` of labelled sequences: the manifest, totals, and each sequence's map and warnings."""
+"""`report.html` of labelled sequences: totals, what failed and why, and each sequence's map and warnings."""
 
 from __future__ import annotations
 
 import tempfile
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sivo.errors import InputError
+from sivo.labeling.store import DONE, read_records
 from sivo.report.map_picture import draw_map
 from sivo.report.page import Page
 from sivo.report.palettes import PALETTES, Palette
@@ -16,44 +17,37 @@ from sivo.report.plain_words import warnings
 from sivo.report.run_folder import RunFolder
 
 _MAX_MAPS = 12
+_COLUMNS = (
+    "name", "state", "frames", "tracked", "trusted", "segments", "tracks", "stable", "unstable", "ignore", "withheld",
+    "seconds",
+)  # fmt: skip
 
 
 def write_label_page(folder: Path, path: Path, palette: Palette = PALETTES["paper"]) -> None:
     """Write the page of a folder of `sivo label`.
 
     Raises:
-        InputError: the manifest cannot be read.
+        InputError: a record cannot be read.
     """
-    rows = _manifest(folder / "manifest.parquet")
-    runs = [RunFolder(run_json.parent) for run_json in sorted(folder.glob("**/run.json"))]
-    totals = {
-        name: sum(int(run.report["tracks"].get(name, 0)) for run in runs) for name in ("stable", "unstable", "ignore")
-    }
+    rows = [asdict(record) for record in read_records(folder)]
+    runs = [RunFolder(run_json.parent) for run_json in sorted(folder.glob("[!.]*/run.json"))]
+    totals = {name: sum(int(row[name]) for row in rows) for name in ("stable", "unstable", "ignore", "withheld")}
     page = Page(f"Labels of {len(rows)} sequences", f"In {folder}.")
     page.tiles(
         [
-            (str(len(runs)), "sequences with labels"),
-            (f"{sum(run.report['frames']['tracked'] for run in runs):,}", "frames with a pose"),
+            (f"{len(runs)} of {len(rows)}", "sequences with labels"),
+            (f"{sum(int(row['tracked']) for row in rows):,}", "frames with a pose"),
             *((f"{count:,}", f"{name} tracks") for name, count in totals.items()),
         ]
     )
-    page.heading("Manifest")
-    columns = list(rows[0]) if rows else []
-    page.table(columns, [[_words(row[name]) for name in columns] for row in rows])
+    failed = [f"{row['name']} has no labels: {row['reason']}." for row in rows if row["state"] != DONE]
+    page.warnings(failed, "Every sequence has labels.")
     page.heading("Sequences")
-    page.table(
-        ["sequence", "frames", "with a pose", "pieces", "points", "stable", "unstable", "ignored"],
-        [
-            [
-                run.name,
-                str(run.frames),
-                str(run.report["frames"]["tracked"]),
-                str(len(run.report["segments"])),
-                str(run.report["points"]),
-                *(str(run.report["tracks"].get(name, 0)) for name in totals),
-            ]
-            for run in runs
-        ],
+    page.table(_COLUMNS, [[_words(row[name]) for name in _COLUMNS] for row in rows])
+    page.paragraph(
+        "Withheld: tracks whose label the second opinion took away, because the odometry is not to be trusted where "
+        "they were seen.",
+        note=True,
     )
     for run in runs[:_MAX_MAPS]:
         page.html("<h3>" + run.name.replace("&", "&amp;").replace("<", "&lt;") + "</h3>")
@@ -67,18 +61,6 @@ def write_label_page(folder: Path, path: Path, palette: Palette = PALETTES["pape
                 draw_map(run, picture, palette)
                 page.picture(picture, f"{run.name} from above")
     page.write(path)
-
-
-def _manifest(path: Path) -> list[dict[str, Any]]:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        rows: list[dict[str, Any]] = pq.read_table(path, memory_map=False).to_pylist()
-    except (pa.ArrowException, OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path}: cannot be read as Parquet ({reason}); run `sivo label` again") from None
-    return rows
 
 
 def _words(value: Any) -> str:

@@ -67,7 +67,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
         f"{frames['processed']} frames of {run.camera.width}x{run.camera.height}, {report['input']['format']}; "
         f"frontend {report['frontend']}; poses and map are up to scale.",
     )
-    tracks = report["tracks"]
+    tracks = run.points.counts()
     page.tiles(
         [
             (f"{frames['tracked']} of {frames['processed']}", "frames with a pose"),
@@ -75,7 +75,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
             (f"{report['points']:,}", "map points"),
             (f"{median_error:.2f} px" if np.isfinite(median_error) else "-", "median re-projection error"),
             (f"{report['frames_per_second']:g}", "frames per second"),
-            (f"{tracks.get('stable', 0):,} / {tracks.get('unstable', 0):,}", "stable / unstable tracks"),
+            (f"{tracks['stable']:,} / {tracks['unstable']:,}", "stable / unstable tracks"),
         ]
     )
     page.heading("What to look out for")
@@ -155,7 +155,7 @@ def _charts_section(page: Page, run: RunFolder) -> None:
 
 
 def _labels_section(page: Page, run: RunFolder) -> None:
-    tracks, rule = run.report["tracks"], run.report["configuration"]["labels"]
+    tracks, rule = run.points.counts(), run.report["configuration"]["labels"]
     page.heading("Labels")
     page.paragraph(
         f"A track of at least {rule['min_observations']} observations is stable if its mean re-projection error is "
@@ -163,7 +163,7 @@ def _labels_section(page: Page, run: RunFolder) -> None:
         f"{rule['unstable_max_error']:g} px, and ignored otherwise. Labels are what the frontend learns from."
     )
     names = ("stable", "unstable", "ignore", "withheld")
-    rows = [(name, float(tracks.get(name, 0)), f"{tracks.get(name, 0):,}") for name in names]
+    rows = [(name, float(tracks[name]), f"{tracks[name]:,}") for name in names]
     page.bars(("label", "tracks"), rows)
 
 
