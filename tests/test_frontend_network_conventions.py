@@ -17,7 +17,7 @@ SIZE = (101, 133)  # height, width: neither a multiple of 8
 
 @pytest.fixture(scope="module")
 def lit_pixels() -> NetworkFrontend:
-    return NetworkFrontend(lit_pixel_weights())
+    return NetworkFrontend(lit_pixel_weights(), NetworkSettings(subpixel_radius=0))
 
 
 def image_of(pixels: np.ndarray, size: tuple[int, int] = SIZE) -> UInt8:
@@ -65,7 +65,7 @@ def test_keypoints_stay_out_of_the_border_and_of_the_padding(lit_pixels):
     outside = np.array([[3, 50], [100, 3], [width - 4, 70], [30, height - 4]])
     image = image_of(np.concatenate([inside, outside]))
     assert in_order(lit_pixels(image).keypoints) == in_order(inside)
-    everywhere = NetworkFrontend(lit_pixel_weights(), NetworkSettings(border=0))
+    everywhere = NetworkFrontend(lit_pixel_weights(), NetworkSettings(border=0, subpixel_radius=0))
     corner = np.array([[width - 1, height - 1]])  # repeated by the padding, which must not count
     assert in_order(everywhere(image_of(corner)).keypoints) == in_order(corner)
 
@@ -83,7 +83,7 @@ def test_stability_logits_are_interpolated_between_cell_centres():
 
 
 def test_stability_at_keypoints_is_the_dense_map_there():
-    frontend = NetworkFrontend(random_weights())
+    frontend = NetworkFrontend(random_weights(), NetworkSettings(subpixel_radius=0))
     image = np.random.default_rng(1).integers(0, 256, (77, 90), np.uint8)
     features = frontend(image)
     dense = frontend.stability_map(image)
@@ -125,6 +125,11 @@ def test_refinement_finds_the_centre_of_a_blob():
     heat = np.exp(-((x - centre[0]) ** 2 + (y - centre[1]) ** 2) / (2 * 0.7**2)).astype(np.float32)
     refined = refine(heat, np.array([[17, 12]]), radius=2)
     np.testing.assert_allclose(refined[0], centre, atol=0.05)
+    assert NetworkSettings().subpixel_radius == 4  # the default moves keypoints, and never out of the picture
+    features = NetworkFrontend(random_weights(), NetworkSettings(border=0))(image_of(spread_pixels()))
+    assert (features.keypoints % 1 != 0).any()
+    assert (features.keypoints >= 0).all()
+    assert (features.keypoints <= [SIZE[1] - 1, SIZE[0] - 1]).all()
 
 
 def test_nothing_found_gives_empty_features(lit_pixels):
@@ -136,7 +141,7 @@ def test_nothing_found_gives_empty_features(lit_pixels):
 
 
 def test_colour_and_float_give_what_grey_uint8_gives():
-    frontend = NetworkFrontend(random_weights())
+    frontend = NetworkFrontend(random_weights(), NetworkSettings(subpixel_radius=0))
     grey = np.random.default_rng(2).integers(0, 256, (64, 80), np.uint8)
     expected = frontend(grey)
     assert len(expected) > 10

@@ -95,7 +95,7 @@ def test_same_image_same_features_and_batches_are_single_images():
     single = [frontend(image) for image in images]
     for one, other in zip(single, NetworkFrontend(random_weights()).batch(images), strict=True):
         assert len(one) > 20
-        np.testing.assert_array_equal(one.keypoints, other.keypoints)
+        np.testing.assert_allclose(one.keypoints, other.keypoints, atol=1e-3)
         np.testing.assert_allclose(one.descriptors, other.descriptors, atol=1e-5)
     again = frontend(images[0])
     for field in dataclasses.fields(again):
@@ -199,7 +199,7 @@ def test_exported_onnx_finds_lit_pixels(tmp_path):
     runtime = pytest.importorskip("onnxruntime")
     from sivo.frontend.onnx_export import export_onnx
 
-    export_onnx(lit_pixel_weights(), tmp_path / "m.onnx", NetworkSettings(max_keypoints=5))
+    export_onnx(lit_pixel_weights(), tmp_path / "m.onnx", NetworkSettings(max_keypoints=5, subpixel_radius=0))
     session = runtime.InferenceSession(tmp_path / "m.onnx", providers=["CPUExecutionProvider"])
     image = np.zeros((1, 1, 37, 51), np.float32)
     image[0, 0, [7, 30], [13, 41]] = 1
