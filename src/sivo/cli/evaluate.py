@@ -12,6 +12,7 @@ PROTOCOLS = {
     "trajectory": ("evaluate_trajectory", "a trajectory file against the truth: sub-trajectory errors, ATE"),
     "vo": ("evaluate_vo", "visual odometry with and without stability weights, the paper's Table 2"),
     "homography": ("evaluate_homography", "repeatability and homography accuracy on image pairs"),
+    "stability": ("evaluate_stability", "instability of labels and heads against its true cause, simulated"),
 }
 
 

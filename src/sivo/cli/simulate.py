@@ -48,7 +48,9 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.scenes == 1:
         with tqdm(total=settings.frames, unit="frame", desc="simulate") as bar:
             simulate(settings, arguments.output, **common, progress=bar.update)
-        print(f"{arguments.output}: {settings.frames} frames of {settings.width}x{settings.height}, seed {settings.seed}")
+        print(
+            f"{arguments.output}: {settings.frames} frames of {settings.width}x{settings.height}, seed {settings.seed}"
+        )
         return
     with tqdm(total=arguments.scenes, unit="scene", desc="simulate") as bar:
         folders = simulate_many(

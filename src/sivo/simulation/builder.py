@@ -85,7 +85,7 @@ class SceneBuilder:
         attributes["shininess"] = f"{self.rng.uniform(0.25, 0.8):.3f}"
         if image is not None:
             file = f"{name}.png"
-            self.assets[file] = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 0])[1].tobytes()
+            self.assets[file] = _png(image)
             ET.SubElement(self._asset, "texture", name=name, type="cube" if cube else "2d", file=file)
             attributes["texture"] = name
         ET.SubElement(self._asset, "material", attributes)
@@ -176,14 +176,17 @@ class SceneBuilder:
             self.repeated.add(name)
         if node.moving:
             self.moving.add(name)
-        ET.SubElement(
-            node.element, "geom", name=name, material=material.name, contype="0", conaffinity="0", mass="0.1", **attributes
-        )
+        attributes |= {"name": name, "material": material.name, "contype": "0", "conaffinity": "0", "mass": "0.1"}
+        ET.SubElement(node.element, "geom", attributes)
         return name
 
     def _name(self, kind: str) -> str:
         self._count += 1
         return f"{kind}{self._count}"
+
+
+def _png(image: UInt8) -> bytes:
+    return cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 0])[1].tobytes()
 
 
 def _text(values: Iterable[float]) -> str:

@@ -72,8 +72,9 @@ def sofa(shop: Workshop, node: Node, width: float) -> None:
     for side in (-1, 1):
         builder.box(node, (0.16, 0.8, 0.58), (side * (width / 2 - 0.08), 0.42, 0.29), cloth)
     for x in np.arange(-width / 2 + 0.4, width / 2 - 0.2, pick(rng, (0.45, 0.8))):
-        cushion = builder.body(node, (float(x), 0.34, 0.54), 0.0, 0.0)
-        builder.ellipsoid(cushion, (0.2, 0.09, 0.2), (0, 0, 0), palette.shirt())
+        cushion = builder.body(node, (float(x), 0.3, 0.56), pick(rng, (-0.2, 0.2)))
+        builder.ellipsoid(cushion, (0.2, 0.07, 0.17), (0, 0, 0), palette.shirt())
+        builder.box(cushion, (0.34, 0.09, 0.3), (0, 0, 0), palette.cloth(), step=0.1)
 
 
 def cabinet(shop: Workshop, node: Node, width: float) -> None:
@@ -99,16 +100,18 @@ def cabinet(shop: Workshop, node: Node, width: float) -> None:
 def plant(shop: Workshop, node: Node, width: float) -> None:
     """A pot with leaves."""
     builder, palette, rng = shop.builder, shop.palette, shop.builder.rng
-    builder.lathe(node, [(0.0, 0.0), (0.12, 0.0), (0.17, 0.32), (0.15, 0.32), (0.0, 0.28)], (0, 0.25, 0), palette.label())
+    builder.lathe(
+        node, [(0.0, 0.0), (0.12, 0.0), (0.17, 0.32), (0.15, 0.32), (0.0, 0.28)], (0, 0.25, 0), palette.label()
+    )
     stem = pick(rng, (0.6, 1.1))
     builder.capsule(node, (0, 0.25, 0.25), (0.03, 0.25, stem), 0.015, palette.wood())
-    greens = [
-        builder.material(None, colour=(pick(rng, (0.1, 0.3)), pick(rng, (0.35, 0.6)), 0.15), shine=0.4) for _ in range(3)
-    ]
+    greens = [(pick(rng, (0.1, 0.3)), pick(rng, (0.35, 0.6)), 0.15) for _ in range(3)]
+    leaves = [builder.material(None, colour=green, shine=0.4) for green in greens]
     for index in range(26):
-        angle, reach, z = rng.uniform(0, 2 * np.pi), pick(rng, (0.06, 0.24)), pick(rng, (0.5, 1.0)) * (stem + 0.25)
-        leaf = builder.body(node, (reach * np.cos(angle), 0.27 + reach * np.sin(angle), z), float(angle), pick(rng, (-0.9, 0.7)))
-        builder.ellipsoid(leaf, (0.13, 0.045, 0.006), (0, 0, 0), greens[index % 3])
+        angle, reach, z = pick(rng, (0, 2 * np.pi)), pick(rng, (0.06, 0.24)), pick(rng, (0.5, 1.0)) * (stem + 0.25)
+        at = (reach * float(np.cos(angle)), 0.27 + reach * float(np.sin(angle)), z)
+        leaf = builder.body(node, at, angle, pick(rng, (-0.9, 0.7)))
+        builder.ellipsoid(leaf, (0.13, 0.045, 0.006), (0, 0, 0), leaves[index % 3])
 
 
 def boxes(shop: Workshop, node: Node, width: float) -> None:
@@ -151,14 +154,15 @@ def thing(shop: Workshop, node: Node, position: tuple[float, float, float], most
     x, y, z = position
     kind = int(rng.integers(0, 7))
     if kind == 0:
-        height = min(pick(rng, (0.12, 0.26)), most)
-        builder.box(node, (pick(rng, (0.08, 0.18)), pick(rng, (0.05, 0.14)), height), (x, y, z + height / 2), palette.package(), pick(rng, (-0.8, 0.8)))
+        size = (pick(rng, (0.08, 0.18)), pick(rng, (0.05, 0.14)), min(pick(rng, (0.12, 0.26)), most))
+        builder.box(node, size, (x, y, z + size[2] / 2), palette.package(), pick(rng, (-0.8, 0.8)))
     elif kind == 1:
         height, radius = min(pick(rng, (0.16, 0.3)), most), pick(rng, (0.03, 0.05))
-        neck = [(radius, 0), (radius, 0.55), (0.35 * radius, 0.72), (0.3 * radius, 1.0)]
-        builder.lathe(node, [(0.0, 0.0)] + [(r, h * height) for r, h in neck] + [(0.0, height)], position, palette.label())
+        neck = [(radius, 0), (radius, 0.55), (0.35 * radius, 0.72), (0.3 * radius, 1.0), (0.0, 1.0)]
+        builder.lathe(node, [(0.0, 0.0), *((r, h * height) for r, h in neck)], position, palette.label())
     elif kind == 2:
-        builder.lathe(node, [(0.0, 0.0), (0.038, 0.0), (0.042, 0.095), (0.036, 0.095), (0.034, 0.02), (0.0, 0.02)], position, palette.label())
+        mug = [(0.0, 0.0), (0.038, 0.0), (0.042, 0.095), (0.036, 0.095), (0.034, 0.02), (0.0, 0.02)]
+        builder.lathe(node, mug, position, palette.label())
     elif kind == 3:
         radius = min(pick(rng, (0.04, 0.09)), most / 2)
         builder.ellipsoid(node, (radius, radius, radius), (x, y, z + radius), palette.label(cube=True))
@@ -168,7 +172,8 @@ def thing(shop: Workshop, node: Node, position: tuple[float, float, float], most
             thick = pick(rng, (0.02, 0.04))
             if tall + thick > most:
                 break
-            builder.box(node, (0.2, 0.15, thick), (x, y, z + tall + thick / 2), palette.package(), pick(rng, (-0.5, 0.5)))
+            at = (x, y, z + tall + thick / 2)
+            builder.box(node, (0.2, 0.15, thick), at, palette.package(), pick(rng, (-0.5, 0.5)))
             tall += thick
     elif kind == 5:
         frame = builder.body(node, (x, y, z), pick(rng, (-0.5, 0.5)))

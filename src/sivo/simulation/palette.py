@@ -94,7 +94,9 @@ class Palette:
         rgb = textures.colour(self._builder.rng, (0.05, 0.8), (0.3, 0.95)) / 255
         return self._builder.material(None, colour=[float(value) for value in rgb], shine=shine)
 
-    def _share(self, plain: tuple[Texture, ...], repeated: tuple[Texture, ...], rich: tuple[Texture, ...]) -> tuple[Texture, ...]:
+    def _share(
+        self, plain: tuple[Texture, ...], repeated: tuple[Texture, ...], rich: tuple[Texture, ...]
+    ) -> tuple[Texture, ...]:
         """One of three groups, in the shares of the settings."""
         draw = self._builder.rng.uniform()
         if draw < self._settings.plain_share:

@@ -44,7 +44,9 @@ def floor_path(rng: np.random.Generator, floor: Floor, clearance: float, speed: 
     best: tuple[float, float, Float64] | None = None  # clearance that counts, length, points
     for _ in range(500):
         waves = np.arange(1, 4)
-        wobble = 1 + (rng.uniform(0, 0.2, 3) * np.cos(angles[:, None] * waves + rng.uniform(0, 2 * np.pi, 3))).sum(axis=1)
+        wobble = 1 + (rng.uniform(0, 0.2, 3) * np.cos(angles[:, None] * waves + rng.uniform(0, 2 * np.pi, 3))).sum(
+            axis=1
+        )
         reach = rng.uniform(0.15, 0.75, 2) * half
         centre = rng.uniform(-0.6, 0.6, 2) * half
         points = centre + reach * np.column_stack([wobble * np.cos(angles), wobble * np.sin(angles)])
@@ -118,7 +120,7 @@ class _Tremor:
 
     def __init__(self, rng: np.random.Generator, axes: int, band: tuple[float, float], size: float) -> None:
         count = 8
-        self._frequency = np.exp(rng.uniform(*np.log(band), (count, axes)))
+        self._frequency = np.exp(rng.uniform(np.log(band[0]), np.log(band[1]), (count, axes)))
         self._phase = rng.uniform(0, 2 * np.pi, (count, axes))
         amplitude = rng.uniform(0.5, 1.0, (count, axes)) / self._frequency
         self._amplitude = size * np.sqrt(2) * amplitude / np.linalg.norm(amplitude, axis=0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sivo.simulation.textures import SIZE, blend, carpet, cloud, colour
+from sivo.simulation.textures import SIZE, blend, carpet, cloud, colour, rgb
 from sivo.types import UInt8
 
 _LETTERS = np.array(list("ABCDEFGHIJKLMNOPRSTUVWXYZabcdefghijklmnoprstuvwxyz0123456789"))
@@ -45,7 +45,7 @@ def landscape(rng: np.random.Generator) -> UInt8:
     rows = np.arange(SIZE)[:, None]
     for ridge in range(5):
         profile = cloud(rng, 7)[0] * 130 + 180 + 62 * ridge
-        tone = np.float32([40, 90, 50]) * rng.uniform(0.6, 1.3, 3) + (4 - ridge) * 18
+        tone = rgb(40, 90, 50) * rng.uniform(0.6, 1.3, 3).astype(np.float32) + (4 - ridge) * 18
         rough = blend(cloud(rng, 8, first=8), tone * 0.6, tone * 1.2)
         image = np.where((rows > profile[None, :])[..., None], rough, image)
         for _ in range(9 * (ridge > 1)):
@@ -67,9 +67,9 @@ def printed_page(rng: np.random.Generator) -> UInt8:
     for column in range(columns):
         x0 = 28 + column * (width + 8)
         for y in range(128, SIZE - 20, 22):
-            text = " ".join(word(rng) for _ in range(12))[: int(width / 10.5)]
-            cv2.putText(image, text, (x0, y), font, 0.52, ink.tolist(), 1, cv2.LINE_AA)
-    x, y = rng.integers(40, 250), rng.integers(150, 300)
+            line = " ".join(word(rng) for _ in range(12))[: int(width / 10.5)]
+            cv2.putText(image, line, (x0, y), font, 0.52, ink.tolist(), 1, cv2.LINE_AA)
+    x, y = int(rng.integers(40, 250)), int(rng.integers(150, 300))
     figure = cv2.resize(abstract(rng), (190, 150), interpolation=cv2.INTER_AREA)
     image[y : y + 150, x : x + 190] = figure
     return image
@@ -97,7 +97,9 @@ def poster(rng: np.random.Generator) -> UInt8:
     picture = (abstract, landscape, printed_page, mosaic, abstract)[rng.integers(0, 5)](rng)
     margin = int(rng.integers(8, 40))
     image = cv2.copyMakeBorder(picture, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=(245, 242, 235))
-    image = cv2.copyMakeBorder(image, 10, 10, 10, 10, cv2.BORDER_CONSTANT, value=colour(rng, (0, 0.5), (0.05, 0.5)).tolist())
+    image = cv2.copyMakeBorder(
+        image, 10, 10, 10, 10, cv2.BORDER_CONSTANT, value=colour(rng, (0, 0.5), (0.05, 0.5)).tolist()
+    )
     return cv2.resize(image, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
 
 
@@ -112,7 +114,16 @@ def book_spines(rng: np.random.Generator) -> UInt8:
         cv2.rectangle(image, (x, top), (x + width - 3, SIZE), tone.tolist(), -1)
         title = np.zeros((width, SIZE, 3), np.uint8) + tone.astype(np.uint8)
         scale = width / 46
-        cv2.putText(title, f"{word(rng, 5, 9)} {word(rng)}", (40, int(width * 0.66)), int(rng.choice(_FONTS)), scale, ink.tolist(), 2, cv2.LINE_AA)
+        cv2.putText(
+            title,
+            f"{word(rng, 5, 9)} {word(rng)}",
+            (40, int(width * 0.66)),
+            int(rng.choice(_FONTS)),
+            scale,
+            ink.tolist(),
+            2,
+            cv2.LINE_AA,
+        )
         upright = cv2.rotate(title, cv2.ROTATE_90_CLOCKWISE)[: SIZE - top, 2 : min(width - 5, SIZE - x)]
         image[top:, x + 2 : x + 2 + upright.shape[1]] = upright
         for band in rng.integers(top + 10, SIZE - 10, 2):

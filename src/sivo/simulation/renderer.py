@@ -21,8 +21,8 @@ _OPTIONS = """
 <option/><compiler angle="radian"/><statistic extent="1" center="0 0 1"/>
 <visual>
   <map znear="{near}" zfar="{far}" shadowclip="1"/>
-  <quality shadowsize="2048" offsamples="4" numslices="24" numstacks="12"/>
-  <headlight ambient="0.42 0.42 0.43" diffuse="0 0 0" specular="0 0 0"/>
+  <quality shadowsize="1024" offsamples="4" numslices="24" numstacks="12"/>
+  <headlight ambient="0.52 0.52 0.53" diffuse="0 0 0" specular="0 0 0"/>
   <global offwidth="{width}" offheight="{height}"/>
 </visual>"""
 
@@ -53,9 +53,7 @@ class SceneRenderer:
         try:
             self._renderer: Any = mujoco.Renderer(model, camera.height, camera.width, max_geom=model.ngeom + 100)
         except (RuntimeError, AttributeError, ImportError, mujoco.FatalError) as error:
-            raise InputError(
-                f"simulate: no OpenGL without a display ({error}); install libosmesa6, or set MUJOCO_GL=egl with a driver"
-            ) from None
+            raise _no_display(error) from None
         for flag in (mujoco.mjtRndFlag.mjRND_SKYBOX, mujoco.mjtRndFlag.mjRND_HAZE, mujoco.mjtRndFlag.mjRND_FOG):
             self._renderer.scene.flags[flag] = 0
         self._specular = model.mat_specular.copy()
@@ -123,7 +121,12 @@ def _import_mujoco() -> ModuleType:
     except ImportError:
         raise MissingExtraError("simulate", "simulate") from None
     except (AttributeError, RuntimeError, OSError) as error:
-        raise InputError(
-            f"simulate: no OpenGL without a display ({error}); install libosmesa6, or set MUJOCO_GL=egl with a driver"
-        ) from None
+        raise _no_display(error) from None
     return mujoco
+
+
+def _no_display(error: Exception) -> InputError:
+    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return InputError(
+        f"simulate: no OpenGL without a display ({reason}); install libosmesa6, or set MUJOCO_GL=egl with a driver"
+    )

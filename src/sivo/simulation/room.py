@@ -136,7 +136,11 @@ def _window(shop: Workshop, wall: Wall, taken: list[tuple[float, float, float]])
 
 
 def _furniture(
-    shop: Workshop, settings: SimulationSettings, floor: Floor, walls: list[Wall], taken: list[list[tuple[float, float, float]]]
+    shop: Workshop,
+    settings: SimulationSettings,
+    floor: Floor,
+    walls: list[Wall],
+    taken: list[list[tuple[float, float, float]]],
 ) -> None:
     rng = shop.builder.rng
     tall = {bookshelf, plant}
@@ -182,14 +186,19 @@ def _middle(shop: Workshop, settings: SimulationSettings, floor: Floor) -> None:
     """A table with chairs and things, away from the walls."""
     builder, rng = shop.builder, shop.builder.rng
     size = (pick(rng, (0.6, 0.8)), pick(rng, (0.9, 1.3)))
-    centre = (pick(rng, (0.05, 0.18)) * floor.width * float(rng.choice([-1, 1])), pick(rng, (-0.15, 0.15)) * floor.length)
+    centre = (
+        pick(rng, (0.05, 0.18)) * floor.width * float(rng.choice([-1, 1])),
+        pick(rng, (-0.15, 0.15)) * floor.length,
+    )
     node = builder.body(builder.world, (*centre, 0.0), 0.0)
     table(shop, node, size, 0.74, (0.0, 0.0))
     for _ in range(settings.clutter // 2):
         x, y = (rng.uniform(-0.5, 0.5, 2) * (np.asarray(size) - 0.16)).tolist()
         thing(shop, node, (x, y, 0.74), most=0.28)
     side = float(rng.choice([-1, 1]))
-    seat = builder.body(node, (side * (size[0] / 2 + 0.2), pick(rng, (-0.2, 0.2)), 0), -side * np.pi / 2 + pick(rng, (-0.4, 0.4)))
+    seat = builder.body(
+        node, (side * (size[0] / 2 + 0.2), pick(rng, (-0.2, 0.2)), 0), -side * np.pi / 2 + pick(rng, (-0.4, 0.4))
+    )
     chair(shop, seat)
     half = (size[0] / 2 + 0.05, size[1] / 2 + 0.05)
     reach = (half[0] + 0.4 * (side < 0), half[0] + 0.4 * (side > 0))

@@ -79,7 +79,7 @@ def _lights(shop: Workshop, floor: Floor, settings: SimulationSettings) -> None:
     glow = builder.material(None, colour=(1.0, 0.97, 0.9), emission=1.0, shine=0.0)
     builder.lathe(builder.world, [(0.0, -0.06), (0.16, -0.05), (0.18, 0.0)], (x, y, height), glow)
     builder.light(builder.world, (x, y, height - 0.1), (0, 0, -1), 0.7 * settings.brightness, shadow=True, cutoff=84)
-    builder.light(builder.world, (-x, -y, 1.2), (0, 0, 1), 0.4 * settings.brightness, shadow=False, cutoff=180)
-    builder.light(builder.world, (x, -y, 1.4), (0, 0, -1), 0.5 * settings.brightness, shadow=False, cutoff=180)
+    builder.light(builder.world, (-x, -y, 1.2), (0, 0, 1), 0.55 * settings.brightness, shadow=False, cutoff=180)
+    builder.light(builder.world, (x, -y, 1.4), (0, 0, -1), 0.55 * settings.brightness, shadow=False, cutoff=180)
     if settings.swinging_lamp:
         swinging_lamp(shop, (-x, -y), height, 0.45 * settings.brightness)

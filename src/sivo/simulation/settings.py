@@ -57,7 +57,9 @@ class SimulationSettings:
             if getattr(self, name) < minimum:
                 raise ConfigError(f"setting `{name}`: {getattr(self, name)} is too small; at least {minimum}")
         if not (self.fps > 0 and 20 <= self.fov <= 120):
-            raise ConfigError(f"settings `fps` {self.fps} and `fov` {self.fov}: fps above 0, fov from 20 to 120 degrees")
+            raise ConfigError(
+                f"settings `fps` {self.fps} and `fov` {self.fov}: fps above 0, fov from 20 to 120 degrees"
+            )
         if not 3.5 <= min(self.room_size) <= max(self.room_size) <= 12:
             raise ConfigError(f"setting `room_size`: {self.room_size} must lie between 3.5 and 12 metres")
 

@@ -65,7 +65,9 @@ def lathe(profile: list[tuple[float, float]], tile: float | None = None, slices:
         normals = np.column_stack([slope[0] * ring, np.full(len(angles), slope[1])])
         u = angles / (2 * np.pi) if tile is None else angles / (2 * np.pi) * around / tile
         scale = lengths[-1] if tile is None else tile
-        texture = np.concatenate([np.column_stack([u, np.full(len(u), 1 - length / scale)]) for length in lengths[row : row + 2]])
+        texture = np.concatenate(
+            [np.column_stack([u, np.full(len(u), 1 - length / scale)]) for length in lengths[row : row + 2]]
+        )
         n = len(angles)
         index = np.arange(n - 1)
         faces = np.concatenate(

@@ -16,8 +16,13 @@ SIZE = 512
 
 def colour(rng: np.random.Generator, saturation: tuple[float, float], value: tuple[float, float]) -> Float32:
     """A random RGB colour (3,) in 0..255."""
-    rgb = colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(*saturation), rng.uniform(*value))
-    return np.float32(rgb) * np.float32(255.0)
+    red, green, blue = colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(*saturation), rng.uniform(*value))
+    return rgb(255 * red, 255 * green, 255 * blue)
+
+
+def rgb(red: float, green: float, blue: float) -> Float32:
+    """A colour (3,) in 0..255."""
+    return np.array([red, green, blue], np.float32)
 
 
 def cloud(rng: np.random.Generator, octaves: int = 6, size: int = SIZE, first: int = 2, aspect: int = 1) -> Float32:
@@ -75,8 +80,8 @@ def wood(rng: np.random.Generator) -> UInt8:
         bend += 0.12 * np.exp(-((distance / 0.05) ** 2)).astype(np.float32)
     rings = 0.5 + 0.5 * np.sin(2 * np.pi * rng.uniform(7, 13) * (y + bend))
     fine = cloud(rng, 6, first=4, aspect=8)
-    hue = np.float32([rng.uniform(110, 190), rng.uniform(70, 120), rng.uniform(30, 75)])
-    return blend(np.float32(0.4) * rings + np.float32(0.6) * fine, hue * 0.72, hue * 1.25)
+    hue = rgb(rng.uniform(110, 190), rng.uniform(70, 120), rng.uniform(30, 75))
+    return blend((0.4 * rings + 0.6 * fine).astype(np.float32), hue * 0.72, hue * 1.25)
 
 
 def planks(rng: np.random.Generator) -> UInt8:
@@ -89,9 +94,9 @@ def planks(rng: np.random.Generator) -> UInt8:
         while x < SIZE:
             length = int(rng.integers(180, 330))
             y0, x0 = rng.integers(0, SIZE - height), rng.integers(0, 2 * SIZE - length)
-            board = shade(source[y0 : y0 + height, x0 : x0 + length], np.float32(rng.uniform(0.75, 1.15)) * np.ones((1, 1), np.float32))
+            board = source[y0 : y0 + height, x0 : x0 + length] * rng.uniform(0.75, 1.15)
             left, right = max(x, 0), min(x + length, SIZE)
-            image[row * height : (row + 1) * height, left:right] = board[:, left - x : right - x]
+            image[row * height : (row + 1) * height, left:right] = np.clip(board[:, left - x : right - x], 0, 255)
             cv2.line(image, (x, row * height), (x, (row + 1) * height), (40, 25, 15), 2)
             x += length
         cv2.line(image, (0, row * height), (SIZE, row * height), (40, 25, 15), 2)
@@ -100,8 +105,8 @@ def planks(rng: np.random.Generator) -> UInt8:
 
 def bricks(rng: np.random.Generator) -> UInt8:
     """A brick wall; every brick has its own shade."""
-    mortar = blend(cloud(rng, 7, first=4), np.float32([150, 145, 138]), np.float32([190, 185, 178]))
-    base = np.float32([rng.uniform(120, 190), rng.uniform(60, 100), rng.uniform(45, 80)])
+    mortar = blend(cloud(rng, 7, first=4), rgb(150, 145, 138), rgb(190, 185, 178))
+    base = rgb(rng.uniform(120, 190), rng.uniform(60, 100), rng.uniform(45, 80))
     rough = cloud(rng, 8, first=8)
     image = mortar
     for row in range(8):
@@ -177,7 +182,17 @@ def carpet(rng: np.random.Generator) -> UInt8:
     for _ in range(60):
         centre, axes = rng.integers(80, SIZE - 80, 2), rng.integers(6, 46, 2)
         tone = colour(rng, (0.2, 0.8), (0.25, 0.95))
-        cv2.ellipse(image, centre.tolist(), axes.tolist(), rng.uniform(0, 180), 0, 360, tone.tolist(), int(rng.choice([-1, 3])), cv2.LINE_AA)
+        cv2.ellipse(
+            image,
+            centre.tolist(),
+            axes.tolist(),
+            rng.uniform(0, 180),
+            0,
+            360,
+            tone.tolist(),
+            int(rng.choice([-1, 3])),
+            cv2.LINE_AA,
+        )
     return shade(image, 0.75 + 0.5 * rng.uniform(size=(SIZE, SIZE)).astype(np.float32))
 
 
