@@ -189,6 +189,37 @@ def test_a_widened_network_computes_the_same() -> None:
     assert not torch.allclose(*halves)  # the copies can part ways
 
 
+def test_views_made_in_a_batch_are_those_made_one_by_one() -> None:
+    from sivo.training.adaptation import warp_batch
+    from sivo.training.views import random_view, warp_image
+
+    rng = np.random.default_rng(0)
+    picture = cv2.GaussianBlur(rng.uniform(0, 255, (96, 128)).astype(np.float32), (0, 0), 3)
+    homographies = np.stack([random_view(rng, VIEWS, (128, 96)) for _ in range(5)])
+    together = warp_batch(torch.from_numpy(picture), homographies, (64, 48))[:, 0].numpy()
+    for view, H in zip(together, homographies, strict=True):
+        seen = warp_image(np.ones_like(picture), H, 64, 48) > 0.999
+        assert np.abs(view - warp_image(picture, H, 64, 48))[seen][20:].mean() < 0.5
+
+
+def test_adaptation_finds_the_corners_of_a_board() -> None:
+    from sivo.training.adaptation import adapt, shi_tomasi
+    from sivo.training.pictures import Pictures, Source
+    from sivo.training.settings import AdaptationSettings
+
+    y, x = np.mgrid[0:240, 0:320]
+    board = np.where((x // 40 + y // 40) % 2, 40, 210).astype(np.uint8)
+    corners = np.stack(np.meshgrid(np.arange(1, 8), np.arange(1, 6)), axis=-1).reshape(-1, 2) * 40 - 0.5
+    picture = cv2.GaussianBlur(board, (0, 0), 0.8)
+    settings = AdaptationSettings()
+    pictures = Pictures((Source("board", (picture,), ("board",), 1.0),))
+    labels = adapt(pictures, shi_tomasi(), settings, ViewSettings(), seed=0, progress=False)[0][0]
+    accepted = labels.points[labels.agreement >= settings.accepted]
+    gaps = np.linalg.norm(corners[:, None] - accepted[None], axis=2)
+    assert (gaps.min(axis=1) <= 1.5).mean() > 0.8
+    assert (gaps.min(axis=0) <= 1.5).mean() > 0.9
+
+
 @pytest.fixture
 def photographs(tmp_path: Path) -> Path:
     folder = tmp_path / "photographs"
