@@ -92,6 +92,8 @@ def test_browser_loads_it_without_errors_and_slider_and_map_respond(page: Path, 
     browser.find_element("css selector", "input[name=overlay][value=labels]").click()
     until(lambda: frame.get_attribute("data-overlay") == "labels")
     assert pixels() != with_tracks
+    legends = browser.find_elements("css selector", "[data-legend]")
+    assert [legend.get_attribute("data-legend") for legend in legends if legend.is_displayed()] == ["labels"]
 
     yaw = scene.get_attribute("data-yaw")
     ActionChains(browser).move_to_element(scene).click_and_hold().move_by_offset(60, 10).release().perform()

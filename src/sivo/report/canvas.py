@@ -13,6 +13,8 @@ Pixels = NDArray[np.floating]
 _SHIFT = 4  # OpenCV's fixed-point digits
 _TARGET_WIDTH = 1280  # small frames are enlarged to about this, so that lines and letters are crisp
 _BAR_HEIGHT = 30
+_PLAIN_WIDTH = 760  # pixels of a picture with letters of plain size
+_LETTERS = (235, 235, 235)
 
 
 class Canvas:
@@ -74,37 +76,36 @@ class Canvas:
 
 
 def captioned(rgb: UInt8, text: str, ramp: tuple[UInt8, str, str] | None = None) -> UInt8:
-    """A picture with a caption bar below; text that does not fit is drawn smaller."""
+    """A picture with a caption bar below; letters grow with the picture, and shrink for text that does not fit."""
     import cv2
 
-    height, width = _BAR_HEIGHT, rgb.shape[1]
-    bar = np.full((height, width, 3), 24, np.uint8)
-    right = width - 8
-    if ramp is not None:
-        colours, low, high = ramp
-        right = _draw_ramp(bar, colours, low, high)
-    font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.5
-    (text_width, _), _ = cv2.getTextSize(text, font, size, 1)
+    width = rgb.shape[1]
+    unit = max(1.0, width / _PLAIN_WIDTH)
+    bar = np.full((round(_BAR_HEIGHT * unit), width, 3), 24, np.uint8)
+    right = width - 8 if ramp is None else _draw_ramp(bar, *ramp, unit=unit)
+    font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * unit
+    text_width = cv2.getTextSize(text, font, size, 1)[0][0]
     size *= min(1.0, max(0.3, (right - 16) / max(text_width, 1)))
-    cv2.putText(bar, text, (8, 20), font, size, (235, 235, 235), 1, cv2.LINE_AA)
+    baseline = round(20 * unit)
+    cv2.putText(bar, text, (8, baseline), font, size, _LETTERS, max(1, round(unit)), cv2.LINE_AA)
     return np.concatenate([rgb, bar])
 
 
-def _draw_ramp(bar: UInt8, colours: UInt8, low: str, high: str) -> int:
+def _draw_ramp(bar: UInt8, colours: UInt8, low: str, high: str, unit: float) -> int:
     """Draws the ramp at the right end of the bar; returns where the room for text ends."""
     import cv2
 
-    font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.45
-    high_width = cv2.getTextSize(high, font, size, 1)[0][0]
-    low_width = cv2.getTextSize(low, font, size, 1)[0][0]
-    length = 140
-    end = bar.shape[1] - 10 - high_width - 6
+    font, size, thickness = cv2.FONT_HERSHEY_SIMPLEX, 0.45 * unit, max(1, round(unit))
+    gap, length, baseline = round(6 * unit), round(120 * unit), round(20 * unit)
+    high_width = cv2.getTextSize(high, font, size, thickness)[0][0]
+    low_width = cv2.getTextSize(low, font, size, thickness)[0][0]
+    end = bar.shape[1] - 2 * gap - high_width
     start = end - length
     sampled = colours[np.linspace(0, len(colours) - 1, length).astype(int)]
-    bar[8:22, start:end] = sampled[None]
-    cv2.putText(bar, high, (end + 6, 20), font, size, (235, 235, 235), 1, cv2.LINE_AA)
-    cv2.putText(bar, low, (start - low_width - 6, 20), font, size, (235, 235, 235), 1, cv2.LINE_AA)
-    return start - low_width - 16
+    bar[round(8 * unit) : round(22 * unit), start:end] = sampled[None]
+    cv2.putText(bar, high, (end + gap, baseline), font, size, _LETTERS, thickness, cv2.LINE_AA)
+    cv2.putText(bar, low, (start - low_width - gap, baseline), font, size, _LETTERS, thickness, cv2.LINE_AA)
+    return start - low_width - 2 * gap
 
 
 def stacked(pictures: list[UInt8], columns: int) -> UInt8:

@@ -21,6 +21,8 @@ _MAX_POINTS = 40_000  # of a layer; more make the page heavy, not the picture cl
 _LAST_POSES = 30  # N_last
 _JPEG_QUALITY = 55
 _NO_ERROR = 255
+_FLOW = 5  # frames behind each point
+_JUMP_SHARE = 0.06  # of the image width; longer links are not drawn
 
 
 def scene_data(run: RunFolder, palette: Palette) -> dict[str, Any]:
@@ -116,11 +118,13 @@ def _packed_points(run: RunFolder, position: int, old: int, large_error: float) 
     row = np.dtype([("now", "<u2", 2), ("before", "<u2", 2), ("age", "u1"), ("error", "u1"), ("label", "u1")])
     packed = np.zeros(len(seen), row)
     before = seen.keypoints.copy()
-    if position > 0:
-        earlier = run.rows_of(position - 1, seen.track)
-        before[earlier >= 0] = run.tracks.keypoints[earlier[earlier >= 0]]
-    jump = np.linalg.norm(seen.keypoints - before, axis=1) > 0.1 * run.camera.width
-    before[jump] = seen.keypoints[jump]  # a line across the picture says less than the dot alone
+    followed = np.ones(len(seen), np.bool_)
+    for frame in range(position - 1, max(position - _FLOW, 0) - 1, -1):
+        rows = run.rows_of(frame, seen.track)
+        earlier = run.tracks.keypoints[rows].astype(np.float64)
+        # a line across the picture, where a link jumps, says less than what lies after the jump alone
+        followed &= (rows >= 0) & (np.linalg.norm(earlier - before, axis=1) < _JUMP_SHARE * run.camera.width)
+        before[followed] = earlier[followed]
     packed["now"] = np.clip(np.round(seen.keypoints * 16), 0, 65535)
     packed["before"] = np.clip(np.round(before * 16), 0, 65535)
     packed["age"] = np.clip(seen.age / old * 255, 0, 255)
