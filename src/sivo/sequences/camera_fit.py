@@ -20,6 +20,7 @@ MIN_COVERAGE = 0.35  # of the picture's cells
 MAX_FOCAL_DEVIATION = 0.01  # of the focal length
 MIN_TILT = 8.0  # degrees between the board and the picture, in the view that is tilted most
 _CELLS = (8, 6)
+_SHARP = 0.75  # of the median sharpness
 _SIMPLER = 0.97  # a richer model must bring the error below this share of the simpler one's
 _OUTLIER = 3.0  # times the median error of the views
 _CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-9)
@@ -72,10 +73,10 @@ def find_views(
 
 
 def choose_views(views: list[View], count: int) -> list[View]:
-    """Sharp views that differ: the least sharp fifth is left out, then always the view farthest from those chosen."""
+    """Sharp views that differ: blurred ones are left out, then always the view farthest from those chosen is taken."""
     if len(views) <= MIN_VIEWS:
         return views
-    least = np.percentile([view.sharpness for view in views], 20)
+    least = _SHARP * float(np.median([view.sharpness for view in views]))
     sharp = [view for view in views if view.sharpness >= least]
     poses = np.stack([view.pose for view in sharp])
     distance = np.linalg.norm(poses - np.median(poses, axis=0), axis=1)

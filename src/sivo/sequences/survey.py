@@ -19,7 +19,7 @@ from sivo.types import Float64, UInt8
 PLACEHOLDER_FOV = 60.0
 DUPLICATE_LEVELS = 0.6  # mean grey levels between neighbours at 160 pixels width: less is the same picture again
 GAP_STEPS = 2.5  # median time steps
-BLUR_SHARE = 0.35  # of the recording's own sharpness
+BLUR_SHARE = 0.5  # of the recording's own sharpness
 DARK, BRIGHT = 30, 225  # median grey levels
 CLIPPED = (5, 250)  # grey levels
 FEW_CORNERS = 60
@@ -197,11 +197,12 @@ def _try(sequence: Sequence, row: int) -> UInt8 | None:
 
 
 def _look(image: UInt8) -> Float64:
-    """Sharpness (standard deviation of the Laplacian over that of the picture), median, share clipped, corners."""
-    height = max(1, round(image.shape[0] * _WORK_WIDTH / image.shape[1]))
-    small = cv2.resize(image, (_WORK_WIDTH, height), interpolation=cv2.INTER_AREA)
-    spread = float(small.std()) + 1.0
-    sharpness = float(cv2.Laplacian(small, cv2.CV_32F).std()) / spread
+    """Sharpness (second over first derivatives, so that little texture is not blur), median, share clipped, corners."""
+    width = min(_WORK_WIDTH, image.shape[1])
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    gradient = np.hypot(cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1))
+    sharpness = float(cv2.Laplacian(small, cv2.CV_32F).std()) / (float(np.sqrt((gradient**2).mean())) + 1.0)
     clipped = float(((small <= CLIPPED[0]) | (small >= CLIPPED[1])).mean())
     corners = cv2.goodFeaturesToTrack(small, 500, 0.01, 5, blockSize=5)
     strong = 0 if corners is None or small.std() < 2 else len(corners)

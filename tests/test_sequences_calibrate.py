@@ -1,0 +1,260 @@
+"""`sivo calibrate`: known cameras are recovered from rendered boards, and sets that cannot give one are refused."""
+
+from __future__ import annotations
+
+import re
+import zlib
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sivo.cli.main import main
+from sivo.errors import InputError
+from sivo.geometry.camera import Camera
+from sivo.geometry.se3 import rigid, so3_exp
+from sivo.sequences.board import Board, _black, parse_board
+from sivo.sequences.calibration import load_calibration
+from sivo.sequences.camera_fit import choose_views, find_views, fit_camera
+from sivo.types import Float64, UInt8
+
+CAMERA = Camera(640, 480, 420.0, 424.0, 312.0, 246.0, (-0.28, 0.09, 0.0004, -0.0006))
+BOARD = Board(9, 6, 0.025)
+_TEXELS = 40  # to a square
+
+
+def board_texture(board: Board, shift: Float64 | None = None) -> UInt8:
+    """The board from above with a white rim of one square, `_TEXELS` to a square."""
+    columns, rows = board.squares
+    picture = np.full(((rows + 2) * _TEXELS, (columns + 2) * _TEXELS), 255, np.uint8)
+    scale = _TEXELS / board.square
+    for x, y, size in _black(board):
+        left, top = (round(v * scale) + _TEXELS for v in (x, y))
+        right, bottom = (round((v + size) * scale) + _TEXELS for v in (x, y))
+        picture[top:bottom, left:right] = 0
+    return picture
+
+
+def rays_of(camera: Camera) -> Float64:
+    """(H, W, 2) undistorted X/Z, Y/Z of each pixel, by Newton's method on the distortion."""
+    x, y = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
+    distorted = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy], axis=-1)
+    rays = distorted.copy()
+    along_x, along_y = np.array([1e-6, 0.0]), np.array([0.0, 1e-6])
+    for _ in range(10):
+        error = distorted - camera.distort(rays)
+        a = (camera.distort(rays + along_x) - camera.distort(rays)) / 1e-6
+        b = (camera.distort(rays + along_y) - camera.distort(rays)) / 1e-6
+        determinant = a[..., 0] * b[..., 1] - b[..., 0] * a[..., 1]
+        dx = (error[..., 0] * b[..., 1] - error[..., 1] * b[..., 0]) / determinant
+        dy = (error[..., 1] * a[..., 0] - error[..., 0] * a[..., 1]) / determinant
+        rays = rays + np.clip(np.stack([dx, dy], axis=-1), -0.2, 0.2)
+    assert np.abs(camera.distort(rays) - distorted).max() < 1e-9
+    return rays
+
+
+class Renderer:
+    """Pictures of a board by a distorted camera: each pixel is the mean of 2x2 rays."""
+
+    def __init__(self, camera: Camera, board: Board) -> None:
+        self.camera, self.board = camera, board
+        fine = camera.resized(2 * camera.width, 2 * camera.height)
+        self.rays = rays_of(fine)
+        self.texture = board_texture(board)
+
+    def picture(self, cam_from_board: Float64, noise: float = 1.0, seed: int = 0) -> UInt8:
+        # the board's plane z = 0 seen along each ray: X = s * ray, (board_from_cam X)_z = 0
+        rotation, translation = cam_from_board[:3, :3], cam_from_board[:3, 3]
+        rays = np.concatenate([self.rays, np.ones((*self.rays.shape[:2], 1))], axis=-1) @ rotation
+        origin = -rotation.T @ translation
+        distance = -origin[2] / rays[..., 2]
+        # the board's points are its inner corners; the texture starts one square and the rim before the first
+        inset = 1 if self.board.charuco else 2
+        texel = (origin[:2] + distance[..., None] * rays[..., :2]) / self.board.square + inset
+        texel = np.where((distance > 0)[..., None], texel * _TEXELS - 0.5, -1e4).astype(np.float32)
+        shown = cv2.remap(self.texture, texel[..., 0], texel[..., 1], cv2.INTER_LINEAR, borderValue=128)
+        small = cv2.resize(shown, (self.camera.width, self.camera.height), interpolation=cv2.INTER_AREA)
+        noisy = 20 + 0.82 * small + np.random.default_rng(seed).normal(0, noise, small.shape)
+        return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+@cache
+def brown_renderer() -> Renderer:
+    return Renderer(CAMERA, BOARD)
+
+
+def board_poses(count: int, board: Board, tilt: float = 0.6, seed: int = 1, reach: float = 1.0) -> list[Float64]:
+    """cam_from_board all over the picture, tilted to all sides."""
+    random = np.random.default_rng(seed)
+    centre = np.append(board.points[:, :2].mean(axis=0), 0.0)
+    poses = []
+    for i in range(count):
+        direction = 2 * np.pi * i / count
+        axis = np.array([np.cos(3 * direction), np.sin(3 * direction), random.uniform(-0.3, 0.3)])
+        rotation = so3_exp(tilt * random.uniform(0.6, 1.0) * axis)
+        depth = random.uniform(0.26, 0.42)
+        place = reach * depth * np.array([0.45 * np.cos(direction), 0.33 * np.sin(direction)])
+        poses.append(rigid(rotation, np.append(place, depth) - rotation @ centre))
+    return poses
+
+
+def max_undistortion_error(truth: Camera, estimate: Camera, views: list) -> float:  # type: ignore[type-arg]
+    """Largest distance in pixels, over the region that the board reached, between where the two cameras send a ray."""
+    pixels = np.concatenate([view.pixels for view in views]).astype(np.float64)
+    rays = np.stack([(pixels[:, 0] - truth.cx) / truth.fx, (pixels[:, 1] - truth.cy) / truth.fy], axis=-1)
+    seen = rays.copy()
+    for _ in range(50):
+        seen = seen + (rays - truth.distort(seen))
+    sent = [camera.distort(seen) * [camera.fx, camera.fy] + [camera.cx, camera.cy] for camera in (truth, estimate)]
+    return float(np.linalg.norm(sent[0] - sent[1], axis=1).max())
+
+
+@pytest.mark.parametrize(
+    ("camera", "board", "model"),
+    [
+        (CAMERA, BOARD, "brown4"),
+        (replace(CAMERA, distortion=()), Board(8, 7, 0.025, charuco=True), "brown4"),
+        (
+            replace(CAMERA, fx=300.0, fy=301.0, distortion=(0.04, -0.015, 0.003, -0.001), distortion_model="fisheye"),
+            BOARD,
+            "fisheye",
+        ),
+    ],
+    ids=["checkerboard", "charuco", "fisheye"],
+)
+def test_known_camera_is_recovered(camera: Camera, board: Board, model: str) -> None:
+    renderer = Renderer(camera, board)
+    pictures = [(f"{i}", renderer.picture(pose, seed=i)) for i, pose in enumerate(board_poses(20, board))]
+    views = find_views(board, pictures)
+    assert len(views) >= 12
+    fit = fit_camera(choose_views(views, 40), (camera.width, camera.height))
+    assert fit.model == model
+    assert fit.camera.fx == pytest.approx(camera.fx, rel=0.002)
+    assert fit.camera.fy == pytest.approx(camera.fy, rel=0.002)
+    assert max_undistortion_error(camera, fit.camera, views) < 0.3
+    # the deviations are of the size of the errors
+    for name in ("fx", "fy", "cx", "cy"):
+        assert abs(getattr(fit.camera, name) - getattr(camera, name)) < 6 * fit.deviations[name] + 0.05
+    assert fit.rms < 0.3
+
+
+def test_calibrated_file_of_a_folder_of_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    renderer = brown_renderer()
+    (tmp_path / "board").mkdir()
+    for i, pose in enumerate(board_poses(16, BOARD)):
+        cv2.imwrite(str(tmp_path / "board" / f"{i:03d}.png"), renderer.picture(pose, seed=i))
+    (tmp_path / "board" / "900.png").write_bytes(b"broken")
+    out = tmp_path / "camera.yaml"
+    assert main(["calibrate", str(tmp_path / "board"), "--board", "9x6:25mm", "-o", str(out)]) == 0
+    camera = load_calibration(str(out)).camera(640, 480)
+    assert camera.fx == pytest.approx(CAMERA.fx, rel=0.004)
+    assert cv2.imread(str(tmp_path / "camera-coverage.png")).shape == (480, 640, 3)
+    printed = capsys.readouterr().out
+    assert re.search(r"RMS 0\.\d+ px", printed)
+    assert re.search(r"fx\s+42\d\.\d+\s+\+- 0\.\d+", printed)
+
+
+def test_degenerate_sets_are_refused_in_plain_words() -> None:
+    renderer = brown_renderer()
+
+    def fit(poses: list[Float64]) -> str:
+        pictures = [(f"{i}", renderer.picture(pose, seed=i)) for i, pose in enumerate(poses)]
+        with pytest.raises(InputError) as error:
+            fit_camera(choose_views(find_views(BOARD, pictures), 40), (640, 480))
+        return str(error.value)
+
+    assert "found in 3 different sharp views" in fit(board_poses(16, BOARD)[:3])
+    assert re.search("always parallel|focal length open", fit(board_poses(16, BOARD, tilt=0.0)))
+    assert "covers only" in fit(board_poses(12, BOARD, reach=0.0, tilt=0.3))
+    assert "found in 0 different" in fit([rigid(np.eye(3), np.array([5.0, 0, 1]))] * 8)
+
+
+def test_another_board_than_was_said_is_not_found() -> None:
+    renderer = brown_renderer()
+    picture = renderer.picture(board_poses(1, BOARD)[0])
+    assert BOARD.find(picture) is not None
+    assert Board(8, 5, 0.025).find(picture) is None or Board(11, 8, 0.025).find(picture) is None
+
+
+def test_views_that_repeat_each_other_count_once() -> None:
+    renderer = brown_renderer()
+    pictures = [(f"{i}", renderer.picture(board_poses(1, BOARD)[0], seed=i)) for i in range(12)]
+    assert len(choose_views(find_views(BOARD, pictures), 40)) <= 2
+
+
+@pytest.mark.parametrize(
+    ("text", "board"),
+    [
+        ("9x6:25mm", Board(9, 6, 0.025)),
+        ("7x5:3cm", Board(7, 5, 0.03)),
+        ("9X6:25", Board(9, 6, 0.025)),
+        ("charuco:8x11:20mm", Board(8, 11, 0.02, charuco=True)),
+    ],
+)
+def test_board_specifications(text: str, board: Board) -> None:
+    parsed = parse_board(text)
+    assert (parsed.columns, parsed.rows, parsed.charuco) == (board.columns, board.rows, board.charuco)
+    assert parsed.square == pytest.approx(board.square)
+
+
+@pytest.mark.parametrize("text", ["", "9x6", "9x6:0mm", "2x2:25mm", "9x6:25ft", "9x6:5m"])
+def test_impossible_boards(text: str) -> None:
+    with pytest.raises(InputError, match="--board"):
+        parse_board(text)
+
+
+def rectangles(pdf: bytes) -> np.ndarray:
+    """x, y, width, height in millimetres of all filled rectangles of a PDF page that Matplotlib wrote."""
+    streams = [zlib.decompress(s) for s in re.findall(rb"stream\n(.*?)\nendstream", pdf, re.DOTALL) if s[:1] == b"x"]
+    number = rb"(-?[\d.]+) (-?[\d.]+)"
+    path = re.compile(number + rb" m\n" + (number + rb" l\n") * 3 + rb"h")
+    found = []
+    for stream in streams:
+        for match in path.findall(stream):
+            x, y = (np.array([float(v) for v in match[k::2]]) * 25.4 / 72 for k in (0, 1))
+            found.append([x.min(), y.min(), np.ptp(x), np.ptp(y)])
+    return np.array(found)
+
+
+@pytest.mark.parametrize(("spec", "side"), [("9x6:25mm", 25.0), ("charuco:7x9:22mm", 22.0)])
+def test_printed_board_has_its_true_size(tmp_path: Path, spec: str, side: float) -> None:
+    out = tmp_path / "board.pdf"
+    assert main(["calibrate", "--print-board", str(out), "--board", spec]) == 0
+    found = rectangles(out.read_bytes())
+    squares = found[np.isclose(found[:, 2], side, atol=1e-3) & np.isclose(found[:, 3], side, atol=1e-3)]
+    board = parse_board(spec)
+    columns, rows = board.squares
+    assert len(squares) == (columns * rows + 1) // 2
+    np.testing.assert_allclose(np.ptp(squares[:, 0]), (columns - 1) * side, atol=1e-2)
+    np.testing.assert_allclose(np.ptp(squares[:, 1]), (rows - 1) * side, atol=1e-2)
+
+
+def test_the_drawn_charuco_board_is_opencvs() -> None:
+    board = Board(7, 9, 0.022, charuco=True)
+    ours = board_texture(board)[_TEXELS:-_TEXELS, _TEXELS:-_TEXELS]
+    theirs = board.charuco_board.generateImage((7 * 280, 9 * 280), marginSize=0)
+    theirs = cv2.resize(theirs, ours.shape[::-1], interpolation=cv2.INTER_AREA)
+    assert np.abs(ours.astype(float) - theirs).mean() < 4
+
+
+def test_board_that_does_not_fit_and_nothing_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate", "--print-board", str(tmp_path / "b.pdf"), "--board", "9x6:60mm"]) == 2
+    assert "does not fit on A4" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+    assert main(["calibrate"]) == 2
+    assert "--print-board" in capsys.readouterr().err
+
+
+def test_real_board(shared_data: Path, tmp_path: Path) -> None:
+    """`checkerboard-desk`'s own camera from its frames (its board has 9 by 6 corners)."""
+    out = tmp_path / "camera.yaml"
+    folder = shared_data / "checkerboard-desk"
+    words = ["calibrate", str(folder), "--board", "9x6:40mm", "--samples", "40", "-o", str(out)]
+    assert main(words) == 0
+    published = load_calibration(str(folder / "camera.yaml")).camera(752, 480)
+    ours = load_calibration(str(out)).camera(752, 480)
+    for name in ("fx", "fy", "cx", "cy"):
+        assert getattr(ours, name) == pytest.approx(getattr(published, name), rel=0.01)

@@ -1,0 +1,108 @@
+"""`sivo info`: what a recording is, what is wrong with it, and what to do."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sequence_builders import CAMERA, images, texture, write_images, write_tum, write_video
+from sivo.cli.main import main
+from sivo.sequences import SequenceSettings
+from sivo.sequences.calibration import calibration_yaml
+from sivo.sequences.survey import Survey, survey
+from sivo.types import UInt8
+
+
+def look(folder: Path, pictures: list[UInt8], times: list[float] | None = None) -> Survey:
+    write_images(folder, pictures)
+    (folder / "camera.yaml").write_text(calibration_yaml(CAMERA, fps=30.0))
+    if times is not None:
+        (folder / "times.txt").write_text("".join(f"{time}\n" for time in times))
+    return survey(folder, SequenceSettings())
+
+
+def said(findings: Survey) -> str:
+    return "\n".join(f"{problem.what} -> {problem.advice}" for problem in findings.problems)
+
+
+def test_a_good_recording_has_no_problems(tmp_path: Path) -> None:
+    write_tum(tmp_path, 12)
+    findings = survey(tmp_path, SequenceSettings())
+    facts = findings.facts
+    assert not findings.problems
+    assert (facts["format"], facts["frames"], facts["size"]) == ("tum", 12, [96, 72])
+    assert facts["frames_per_second"] == pytest.approx(30, rel=1e-3)
+    assert facts["seconds"] == pytest.approx(11 / 30, rel=1e-3)
+    assert facts["camera"]["fx"] == CAMERA.fx
+    assert facts["depth"]["share_of_frames"] == 1.0
+    assert facts["depth"]["median"] == pytest.approx(1.2, abs=0.1)
+    assert facts["ground_truth"]["poses"] == 12
+    assert facts["duplicates"] == 0.0
+
+
+def test_duplicates_are_counted(tmp_path: Path) -> None:
+    pictures = images(10)
+    for i in (2, 5, 8):
+        pictures[i] = pictures[i - 1]
+    findings = look(tmp_path, pictures)
+    assert findings.facts["duplicates"] == pytest.approx(3 / 9, abs=1e-3)
+    assert "--stride 2" in said(findings)
+
+
+def test_gaps_are_found(tmp_path: Path) -> None:
+    findings = look(tmp_path, images(10), [i / 10 if i < 6 else i / 10 + 2.0 for i in range(10)])
+    assert findings.facts["gaps"] == [{"after_frame": 5, "seconds": pytest.approx(2.1)}]
+    assert "1 gaps" in said(findings)
+
+
+def test_blur_darkness_and_missing_texture(tmp_path: Path) -> None:
+    pictures = images(12)
+    blurred = [cv2.GaussianBlur(p, (0, 0), 4) if i % 3 == 1 else p for i, p in enumerate(pictures)]
+    assert "are blurred" in said(look(tmp_path / "blur", blurred))
+    assert "very dark" in said(look(tmp_path / "dark", [(p // 16).astype(np.uint8) for p in pictures]))
+    flat = [np.full((72, 96), 120, np.uint8) for _ in range(4)]
+    assert "little texture" in said(look(tmp_path / "flat", flat))
+    clipped = [np.where(texture(i, 100)[:72, :96] > 128, 255, 0).astype(np.uint8) for i in range(4)]
+    assert "black or white" in said(look(tmp_path / "clipped", clipped))
+
+
+def test_without_or_with_a_wrong_calibration_it_still_looks(tmp_path: Path) -> None:
+    write_video(tmp_path / "v.avi", images(6))
+    findings = survey(tmp_path / "v.avi", SequenceSettings())
+    assert findings.facts["camera"] is None
+    assert "sivo calibrate" in said(findings)
+    (tmp_path / "v.yaml").write_text(calibration_yaml(CAMERA.resized(192, 144)))
+    assert "calibrated for 192x144 but the images are 96x72" in said(survey(tmp_path / "v.avi", SequenceSettings()))
+
+
+def test_unreadable_frames_are_named(tmp_path: Path) -> None:
+    write_tum(tmp_path, 6)
+    (tmp_path / "rgb" / "000003.png").write_bytes(b"")
+    findings = survey(tmp_path, SequenceSettings())
+    assert findings.facts["unreadable"] == [str(tmp_path / "rgb" / "000003.png")]
+    assert "cannot be read" in said(findings)
+
+
+def test_command_prints_text_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_tum(tmp_path, 6)
+    assert main(["info", str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    assert "recognised as  tum" in text
+    assert "6 of 6 frames" in text
+    assert "nothing wrong" in text
+    assert main(["info", str(tmp_path), "--json", "--stride", "2"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["frames"] == 3
+    assert facts["problems"] == []
+    assert main(["info", str(tmp_path / "none")]) == 2
+    assert "no such file" in capsys.readouterr().err
+
+
+def test_real_recordings(shared_data: Path) -> None:
+    kitchen = survey(shared_data / "redkitchen", SequenceSettings())
+    assert "show the same picture" in said(kitchen)  # about a tenth, as its README says
+    assert "little texture" in said(survey(shared_data / "fr3-notexture", SequenceSettings(), samples=20))
