@@ -65,7 +65,9 @@ def pose_tables(results: dict[str, Any], sequences: bool = False) -> str:
             f"{100 * settings['confidence']:.0f} % bootstrap intervals of the same cells:",
             _intervals(results, estimator),
         ]
-    parts += ["### Matching (does not depend on the solver)", _matching(results)]
+    limit = f"{settings['max_error_px']:g} px"
+    parts.append(f"### Matching (matches with depth; repeated and right below {limit})")
+    parts += [_matching(results, gap) for gap in settings["gaps"]]
     if sequences:
         for sequence in results["sequences"]:
             rows = [row for row in results["sequence_rows"] if row["sequence"] == sequence["name"]]
@@ -136,26 +138,23 @@ def _intervals(results: dict[str, Any], estimator: str) -> str:
     return markdown(header, columns_to_rows(frontends, columns))
 
 
-def _matching(results: dict[str, Any]) -> str:
-    """Repeatability, precision and match counts; inliers of the last solver, which is the robust one by default."""
+def _matching(results: dict[str, Any], gap: int) -> str:
+    """Repeatability, precision, match counts and inliers at one gap, means over pairs."""
     settings, frontends, rows = results["settings"], results["frontends"], results["rows"]
     solvers = settings["estimators"]
-    header, columns = [""], []
-    for field, name, places in (
-        ("repeatability", "repeatab.", 3),
-        ("precision", "precision", 3),
-        ("judged_matches", "matches", 0),
-        ("right_matches", "right", 0),
-    ):
-        for gap in settings["gaps"]:
-            header.append(f"{name} {gap}")
-            values = [_cell(rows, frontend, solvers[0], gap, field) for frontend in frontends]
-            columns.append(bold_best([decimals(value, places) for value in values], values))
-    for solver in solvers:
-        for gap in settings["gaps"]:
-            header.append(f"inliers {solver} {gap}")
-            values = [_cell(rows, frontend, solver, gap, "inliers") for frontend in frontends]
-            columns.append([decimals(value, 0) for value in values])
+    fields = [
+        ("repeatability", solvers[0], "repeatability", 3),
+        ("precision", solvers[0], "precision", 3),
+        ("keypoints", solvers[0], "keypoints", 0),
+        ("judged_matches", solvers[0], "matches", 0),
+        ("right_matches", solvers[0], "right", 0),
+        *(("inliers", solver, f"inliers {solver}", 0) for solver in solvers),
+    ]
+    header, columns = [f"Gap {gap}"], []
+    for field, solver, name, places in fields:
+        header.append(name)
+        values = [_cell(rows, frontend, solver, gap, field) for frontend in frontends]
+        columns.append([decimals(value, places) for value in values])
     return markdown(header, columns_to_rows(frontends, columns))
 
 
