@@ -201,8 +201,10 @@ def _look(image: UInt8) -> Float64:
     width = min(_WORK_WIDTH, image.shape[1])
     height = max(1, round(image.shape[0] * width / image.shape[1]))
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    gradient = np.hypot(cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1))
-    sharpness = float(cv2.Laplacian(small, cv2.CV_32F).std()) / (float(np.sqrt((gradient**2).mean())) + 1.0)
+    # kernels of 5 pixels, under which the rounding to grey levels does not count as detail
+    across, down = (cv2.Sobel(small, cv2.CV_32F, *order, ksize=5) for order in ((1, 0), (0, 1)))
+    gradient = float(np.sqrt((across**2 + down**2).mean()))
+    sharpness = float(cv2.Laplacian(small, cv2.CV_32F, ksize=5).std()) / (gradient + 1.0)
     clipped = float(((small <= CLIPPED[0]) | (small >= CLIPPED[1])).mean())
     corners = cv2.goodFeaturesToTrack(small, 500, 0.01, 5, blockSize=5)
     strong = 0 if corners is None or small.std() < 2 else len(corners)
