@@ -24,9 +24,13 @@ def frontend(request) -> NetworkFrontend:
 
 
 @pytest.fixture(scope="module")
-def drawing() -> UInt8:
+def drawings() -> list[UInt8]:
+    return [drawing(seed) for seed in range(5)]
+
+
+def drawing(seed: int) -> UInt8:
     """Bright and dark quadrilaterals on grey, 245 x 330 (height x width), smoothed and a little noisy."""
-    random = np.random.default_rng(4)
+    random = np.random.default_rng(seed)
     image = np.full((245, 330), 120, np.uint8)
     for x in range(40, 320, 60):
         for y in range(40, 230, 55):
@@ -37,10 +41,20 @@ def drawing() -> UInt8:
     return np.clip(cv2.GaussianBlur(image, (0, 0), 0.7) + noise, 0, 255).astype(np.uint8)
 
 
-def share_found(keypoints: Float32, expected: Float32, tolerance: float) -> float:
-    """How many of the expected keypoints have one within the tolerance."""
-    distances = np.linalg.norm(keypoints[:, None] - expected, axis=2)
-    return float((distances.min(axis=0) <= tolerance).mean())
+def agreement(pairs: list[tuple[Float32, Float32]], tolerance: float) -> tuple[float, Float32]:
+    """Share of expected keypoints with a found one within the tolerance, and the mean (x, y) from one to the other.
+
+    Args:
+        pairs: found and expected keypoints of each picture.
+    """
+    offsets, expected_count = [], 0
+    for found, expected in pairs:
+        distances = np.linalg.norm(found[:, None] - expected, axis=2)
+        near = distances.min(axis=0) <= tolerance
+        offsets.append(found[distances.argmin(axis=0)[near]] - expected[near])
+        expected_count += len(expected)
+    together = np.concatenate(offsets)
+    return len(together) / expected_count, together.mean(axis=0)
 
 
 def test_the_card_names_licence_and_data(frontend):
@@ -54,47 +68,52 @@ def test_the_card_names_licence_and_data(frontend):
     assert beside["architecture"]["encoder"] == list(card.architecture.encoder)
 
 
-@pytest.mark.parametrize("shift", [(1, 0), (3, 6), (8, 16)])
-def test_shifting_the_picture_shifts_the_keypoints(frontend, drawing, shift):
-    x, y = shift
-    first, second = drawing[: 245 - y, : 330 - x], drawing[y:, x:]
-    expected = frontend(second).keypoints + shift
-    inside = ((expected > 12) & (expected < [330 - x - 12, 245 - y - 12])).all(axis=1)
-    assert inside.sum() > 40
-    assert share_found(frontend(first).keypoints, expected[inside], 1.0) > 0.8
+@pytest.mark.parametrize(("shift", "least"), [((1, 0), 0.75), ((3, 6), 0.6), ((8, 16), 0.9)])
+def test_shifting_the_picture_shifts_the_keypoints(frontend, drawings, shift, least):
+    pairs = []
+    for picture in drawings:
+        expected = frontend(picture[shift[1] :, shift[0] :]).keypoints + shift
+        inside = ((expected > 20) & (expected < [310, 225])).all(axis=1)
+        assert inside.sum() > 20
+        pairs.append((frontend(picture).keypoints, expected[inside]))
+    share, offset = agreement(pairs, tolerance=3)
+    assert share > least
+    assert np.abs(offset).max() < 0.4  # a convention that is off by a pixel would show as 1, or by half a pixel as 0.5
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_flipping_the_picture_mirrors_the_keypoints(frontend, drawing, axis):
-    expected = frontend(drawing).keypoints.copy()
-    expected[:, 1 - axis] = drawing.shape[axis] - 1 - expected[:, 1 - axis]
-    flipped = frontend(np.ascontiguousarray(np.flip(drawing, axis))).keypoints
-    assert share_found(flipped, expected, 1.5) > 0.7
-    near = np.linalg.norm(flipped[:, None] - expected, axis=2)
-    pairs = near.min(axis=1) <= 2
-    offset = (flipped[pairs] - expected[near.argmin(axis=1)[pairs]]).mean(axis=0)
-    assert np.abs(offset).max() < 0.35  # a convention off by one pixel would show as 1, by half a pixel as 0.5
+def test_flipping_the_picture_mirrors_the_keypoints(frontend, drawings, axis):
+    pairs = []
+    for picture in drawings:
+        expected = frontend(picture).keypoints.copy()
+        expected[:, 1 - axis] = picture.shape[axis] - 1 - expected[:, 1 - axis]
+        pairs.append((frontend(np.ascontiguousarray(np.flip(picture, axis))).keypoints, expected))
+    share, offset = agreement(pairs, tolerance=3)
+    assert share > 0.6
+    assert np.abs(offset).max() < 0.4
 
 
-def test_enlarging_the_picture_carries_the_keypoints(frontend, drawing):
-    large = cv2.resize(drawing, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
-    found, expected = frontend(large).keypoints, 2 * frontend(drawing).keypoints + 0.5
-    near = np.linalg.norm(found[:, None] - expected, axis=2)
-    pairs = near.min(axis=1) <= 4
-    assert pairs.mean() > 0.5
-    offset = np.median(found[pairs] - expected[near.argmin(axis=1)[pairs]], axis=0)
-    assert np.abs(offset).max() < 1.0
+def test_enlarging_the_picture_carries_the_keypoints(frontend, drawings):
+    pairs = []
+    for picture in drawings:
+        large = cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        pairs.append((frontend(large).keypoints, 2 * frontend(picture).keypoints + 0.5))
+    share, offset = agreement(pairs, tolerance=4)
+    assert share > 0.3
+    assert np.abs(offset).max() < 0.5
 
 
-def test_int8_finds_nearly_the_same(frontend, drawing):
+def test_int8_finds_nearly_the_same(frontend, drawings):
     weights = frontend.weights
     if not weights.card.activation_ranges:
         pytest.skip("these weights are not calibrated for int8")
-    int8 = NetworkFrontend(weights, dataclasses.replace(SETTINGS, precision="int8"))(drawing)
-    float32 = frontend(drawing)
-    assert share_found(int8.keypoints, float32.keypoints, 1.0) > 0.85
-    both = np.linalg.norm(int8.keypoints[:, None] - float32.keypoints, axis=2)
-    rows, columns = np.nonzero(both == 0)
-    cosine = (int8.descriptors[rows] * float32.descriptors[columns]).sum(axis=1)
-    assert len(rows) > 50
-    assert np.median(cosine) > 0.99
+    whole = dataclasses.replace(SETTINGS, subpixel_radius=0)
+    exact, rounded = (
+        NetworkFrontend(weights, dataclasses.replace(whole, precision=precision)) for precision in ("float32", "int8")
+    )
+    for picture in drawings[:2]:
+        float32, int8 = exact(picture), rounded(picture)
+        rows, columns = np.nonzero((int8.keypoints[:, None] == float32.keypoints).all(axis=2))
+        assert len(rows) > 0.85 * len(float32)
+        cosine = (int8.descriptors[rows] * float32.descriptors[columns]).sum(axis=1)
+        assert np.median(cosine) > 0.999
