@@ -115,7 +115,7 @@ def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     output: Path | None = arguments.output
     if output is not None:
         make_output_folder(output, COMMAND)
-    default = [] if arguments.features else None
+    default: list[str] | None = [] if arguments.features else None
     loaded, skipped = loaded_frontends(arguments.frontend, settings.max_keypoints, default)
     exported = exported_features(arguments.features, settings.max_keypoints, one_sequence=len(sources) == 1)
     frontends = [*loaded, *exported]
