@@ -69,8 +69,9 @@ def run(arguments: argparse.Namespace) -> int:
     check_output_folder(arguments.output, "run")
     sequence = open_sequence(arguments.sequence, settings.sequence)
     camera = sequence.camera
+    frames = "live, Ctrl-C ends it: frames" if sequence.length is None else f"{sequence.length} frames"
     print(
-        f"{sequence.name}: {sequence.format}, {len(sequence)} frames of {camera.width}x{camera.height}; "
+        f"{sequence.name}: {sequence.format}, {frames} of {camera.width}x{camera.height}; "
         f"frontend {settings.frontend.name}; poses and map are up to scale"
     )
     summary = _track(sequence, arguments.output, settings, _viewer(arguments))
@@ -101,7 +102,7 @@ def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: View
 
     compile_kernels(lambda words: print(words, file=sys.stderr))
     lost = 0
-    with tqdm(total=len(sequence), unit="frame", desc="run", smoothing=0.1, delay=0.5) as bar:
+    with tqdm(total=sequence.length, unit="frame", desc="run", smoothing=0.1, delay=0.5) as bar:
 
         def progress(view: object) -> None:
             nonlocal lost

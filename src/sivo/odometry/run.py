@@ -73,8 +73,8 @@ def run_odometry(
     """
     frontend = frontend or load_odometry_frontend(settings.frontend.name, settings.frontend.max_keypoints)
     viewer = viewer or NullViewer()
-    if len(sequence) < _MIN_FRAMES:
-        raise InputError(f"{sequence.path}: has {len(sequence)} frames; odometry needs at least {_MIN_FRAMES}")
+    if sequence.length is not None and sequence.length < _MIN_FRAMES:
+        raise InputError(f"{sequence.path}: has {sequence.length} frames; odometry needs at least {_MIN_FRAMES}")
     make_output_folder(folder, command)
     seconds: defaultdict[str, float] = defaultdict(float)
     started = time.perf_counter()
@@ -141,7 +141,7 @@ def _report(
         "input": {
             "path": str(sequence.path),
             "format": sequence.format,
-            "frames": len(sequence),
+            "frames": len(processed) if sequence.length is None else sequence.length,
             "first_time": _number(trajectory.times[0] if len(trajectory) else np.nan),
             "last_time": _number(trajectory.times[-1] if len(trajectory) else np.nan),
             "view": sequence.view,

@@ -46,6 +46,10 @@ class LiveSequence(Sequence):
         dropped = self._live.dropped
         return (f"{self.path}: {dropped} frames were dropped to stay with the latest one",) if dropped else ()
 
+    @property
+    def length(self) -> int | None:
+        return None
+
     def __len__(self) -> int:
         raise TypeError(f"{self.path} is live: its length is not known")
 

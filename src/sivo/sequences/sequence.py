@@ -86,6 +86,11 @@ class Sequence:
         truth = self.recording.ground_truth
         return None if truth is None else poses_at(truth, self.times)
 
+    @property
+    def length(self) -> int | None:
+        """The number of selected frames; None where it is not known, because the recording is still going on."""
+        return len(self.indices)
+
     def __len__(self) -> int:
         return len(self.indices)
 
