@@ -26,6 +26,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "simulate": ("simulate", "render rooms with exact depth, poses and causes of instability"),
     "info": ("info", "what a recording was recognised as, and what is wrong with it"),
     "calibrate": ("calibrate", "a camera from a recording of a board, and the board to print"),
+    "demo": ("demo", "the main job on a small bundled recording, in minutes"),
     "config": ("config", "print all settings of a command as YAML"),
 }
 

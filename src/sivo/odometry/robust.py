@@ -31,6 +31,7 @@ class RobustMapper:
         self._keyframes: list[View] = []  # older keyframes: free ones at the end, constants before them
         self._last_keyframe: View | None = None
         self._patience = 0  # frames to wait before the next try to start
+        self._refusals = 0  # costly ones since the last start
         self._health = HealthCheck(camera, settings.health, descriptor_distance, settings.seed)
         self._young: list[View] = []  # all views of a map that may still be started anew; nothing of it is final
 
@@ -108,7 +109,7 @@ class RobustMapper:
         """No map."""
         self._map, self._last_keyframe = None, None
         self._recent, self._keyframes, self._young = [], [], []
-        self._patience = 0
+        self._patience, self._refusals = 0, 0
 
     @staticmethod
     def _forget(views: list[View]) -> None:
@@ -207,7 +208,8 @@ class RobustMapper:
         if isinstance(started, Refusal):
             self._journal.refused(view, started.reason)
             if started.costly:
-                self._patience = 3
+                self._refusals += 1
+                self._patience = min(3 * 2 ** (self._refusals - 1), self._settings.start.max_patience)
             return
         self._map = started
         self._journal.started(self._waiting)

@@ -32,7 +32,8 @@ class StartSettings:
     min_points: int = 30  # over the minimum parallax
     min_inlier_share: float = 0.3  # essential inliers of the matches
     max_mean_error: float = 1.2  # pixels, after adjustment and pruning
-    max_lost_share: float = 0.2  # of the waiting frames, such as black ones, may stay without a pose
+    max_lost: int = 4  # waiting frames in a row, such as black ones, that may stay without a pose
+    max_patience: int = 30  # frames between two tries, doubled from 3 with each costly refusal
 
 
 @dataclass(frozen=True)

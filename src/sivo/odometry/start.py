@@ -185,15 +185,18 @@ def _grow(
     local_map.remember(a)
     local_map.remember(b)
     done = [b]
-    neighbour, without_pose = b, 0
+    neighbour, missed = b, 0
     for view in reversed(waiting[:-1]):
         if view is not a:
             local_map.localise(view, neighbour)
             if view.cam_from_world is None:
-                without_pose += 1
-                if without_pose > settings.start.max_lost_share * len(waiting) + 1:
+                missed += 1
+                if missed <= start.max_lost:
+                    continue
+                if view.position > a.position:
                     return Refusal("the first views do not fit together", costly=True)
-                continue
+                break  # what lies before is another place, or too blurred
+            missed = 0
         done.append(view)
         others = [v for v in done[-16:-1] if v is not view]
         local_map.triangulate(view, [*others, *([a] if view is not a and a not in others else [])])
