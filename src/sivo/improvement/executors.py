@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import multiprocessing
 import os
-import queue
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -56,7 +54,8 @@ def run_in_processes(
         work: a function of a module, since it is sent to the workers by name; so are the jobs and results.
     """
     context = multiprocessing.get_context("spawn")
-    ticks, stop = context.Queue(), context.Event()
+    ticks, stop = context.Value("q", 0), context.Event()
+    told = 0
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))  # the workers' libraries read it when they load
     try:
@@ -65,10 +64,11 @@ def run_in_processes(
             try:
                 while waiting:
                     done, _ = wait(waiting, timeout=_POLL_SECONDS, return_when=FIRST_COMPLETED)
-                    on_ticks(_drain(ticks))
+                    told = _tell(ticks.value, told, on_ticks)
                     for future in done:
                         job = waiting.pop(future)
                         on_result(job, _result(future))
+                _tell(ticks.value, told, on_ticks)
             except BaseException:
                 stop.set()
                 pool.shutdown(wait=True, cancel_futures=True)
@@ -91,13 +91,10 @@ def _result(future: Future[Any]) -> Any:
         return error
 
 
-def _drain(ticks: Any) -> int:
-    """How many ticks have come since last time."""
-    total = 0
-    with contextlib.suppress(queue.Empty):
-        while True:
-            total += ticks.get_nowait()
-    return total
+def _tell(count: int, told: int, on_ticks: Callable[[int], None]) -> int:
+    if count > told:
+        on_ticks(count - told)
+    return count
 
 
 def _start_worker(ticks: Any, stop: Any) -> None:
@@ -114,7 +111,8 @@ def _start_worker(ticks: Any, stop: Any) -> None:
 
 def _work(work: Callable[[Job, Tick], Result], job: Job) -> Result:
     def tick() -> None:
-        _worker_ticks.put(1)
+        with _worker_ticks.get_lock():
+            _worker_ticks.value += 1
         if _worker_stop.is_set():
             raise KeyboardInterrupt
 

@@ -1,0 +1,129 @@
+"""`sivo label` as a user meets it: resumable, the same for any number of workers, one failure spoils no other."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from rendered_walk import write_walk
+
+from sivo.cli.main import main
+from sivo.labeling.labelled import read_labels
+from sivo.labeling.stability import STABLE
+
+OPTIONS = ["--frontend", "orb", "--max-keypoints", "300", "--set", "labels.min_observations=6"]
+
+
+@pytest.fixture(scope="module")
+def walks(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two recordings, and one of black frames."""
+    folder = tmp_path_factory.mktemp("walks")
+    good = [write_walk(folder / name, frames=22, seed=seed) for seed, name in enumerate(("kitchen", "hall"))]
+    black = folder / "black"
+    black.mkdir()
+    for i in range(12):
+        cv2.imwrite(str(black / f"{i:06d}.png"), np.zeros((240, 320), np.uint8))
+    (black / "camera.yaml").write_text((good[0] / "camera.yaml").read_text())
+    return [*good, black]
+
+
+@pytest.fixture(scope="module")
+def labelled(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The store of one run over all of them."""
+    out = tmp_path_factory.mktemp("store") / "labels"
+    assert main(["label", *map(str, walks), "-o", str(out), *OPTIONS]) == 0
+    return out
+
+
+def contents(store: Path) -> dict[str, bytes]:
+    """All label tables, byte for byte."""
+    names = ("tracks.parquet", "points.parquet", "frames.parquet", "trajectory.txt")
+    return {str(p.relative_to(store)): p.read_bytes() for p in sorted(store.rglob("*")) if p.name in names}
+
+
+def test_good_sequences_are_labelled_and_the_bad_one_is_explained(labelled: Path) -> None:
+    rows = {row["name"]: row for row in pq.read_table(labelled / "manifest.parquet").to_pylist()}
+    assert {name: row["state"] for name, row in rows.items()} == {"kitchen": "done", "hall": "done", "black": "failed"}
+    assert rows["kitchen"]["stable"] > 20
+    assert "black" in rows["black"]["reason"]
+    assert not (labelled / "black").exists()
+
+
+def test_the_store_reads_back(labelled: Path, walks: list[Path]) -> None:
+    sequences = read_labels(labelled)
+    assert [sequence.name for sequence in sequences] == ["hall", "kitchen"]
+    kitchen = sequences[1]
+    assert (kitchen.points.stability == STABLE).sum() == kitchen.record.stable
+    assert set(kitchen.tracks.track) == set(kitchen.points.track)
+    assert kitchen.frames.index.tolist() == list(range(22))
+    picture = cv2.imread(str(walks[0] / "000007.png"), cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(kitchen.image(7), picture)
+
+
+def test_a_second_run_does_nothing_and_says_so(
+    labelled: Path, walks: list[Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path: path.stat().st_mtime_ns for path in labelled.rglob("*.parquet") if path.parent != labelled}
+    capsys.readouterr()
+    assert main(["label", *map(str, walks[:2]), "-o", str(labelled), *OPTIONS]) == 0
+    assert "2 of 2 sequences labelled" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_other_settings_are_refused_in_one_line(
+    labelled: Path, walks: list[Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    assert main(["label", str(walks[0]), "-o", str(labelled), "--frontend", "orb", "--max-keypoints", "301"]) == 2
+    message = capsys.readouterr().err.strip()
+    assert message.startswith("sivo: ")
+    assert "--relabel" in message
+    assert "\n" not in message
+
+
+def test_nothing_to_label_is_an_error(walks: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["label", str(walks[2]), "-o", str(tmp_path / "labels"), *OPTIONS]) == 2
+    assert "nothing could be labelled; black: " in capsys.readouterr().err
+
+
+def test_workers_give_the_same_bytes(labelled: Path, walks: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "labels"
+    assert main(["label", *map(str, walks), "-o", str(out), "--workers", "2", *OPTIONS]) == 0
+    assert contents(out) == contents(labelled)
+
+
+def test_packed_frames_need_no_recording(walks: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "labels"
+    assert main(["label", str(walks[0]), "-o", str(out), "--pack", *OPTIONS]) == 0
+    (sequence,) = read_labels(out)
+    moved = sequence.folder.rename(tmp_path / "elsewhere")
+    assert len(list(moved.glob("images-*.parquet"))) == 1
+    packed = type(sequence)(moved, sequence.record, sequence.settings).image(5)
+    picture = cv2.imread(str(walks[0] / "000005.png"), cv2.IMREAD_GRAYSCALE)
+    assert np.abs(packed.astype(int) - picture).mean() < 3
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
+def test_a_killed_run_resumes_to_the_same_labels(labelled: Path, walks: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "labels"
+    command = [sys.executable, "-m", "sivo", "label", *map(str, walks[:2]), "-o", str(out), *OPTIONS]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while not list(out.glob(".*.partial/.tracks*")) and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    assert list(out.glob(".*.partial"))
+    assert not list(out.glob("*/label.json"))
+    assert main(command[3:]) == 0
+    assert contents(out) == contents(labelled)
+    assert not list(out.glob(".*.partial"))

@@ -1,0 +1,123 @@
+"""The label store's folder: atomic, resumable, one set of settings; packed frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from sivo.errors import ConfigError, InputError, OutputError
+from sivo.labeling import frames as frames_module
+from sivo.labeling.frames import FramesTable, PackedImages, pack_images, read_frames, write_frames
+from sivo.labeling.store import DONE, FAILED, LabelStore, SequenceRecord, read_records, sequence_names
+
+SETTINGS = {"frontend": {"name": "orb", "max_keypoints": 500}, "seed": 0}
+
+
+def finish(store: LabelStore, name: str) -> None:
+    folder = store.partial(name)
+    folder.mkdir()
+    (folder / "tracks.parquet").write_text("rows")
+    store.finish(SequenceRecord(name, f"/recordings/{name}", DONE, stable=3))
+
+
+def test_a_sequence_appears_when_it_is_complete(tmp_path):
+    store = LabelStore(tmp_path / "labels", SETTINGS)
+    folder = store.partial("kitchen")
+    folder.mkdir()
+    assert not store.is_done("kitchen")
+    finish(store, "kitchen")
+    assert store.is_done("kitchen")
+    assert (tmp_path / "labels" / "kitchen" / "tracks.parquet").is_file()
+    assert pq.read_table(tmp_path / "labels" / "manifest.parquet").to_pylist()[0]["stable"] == 3
+
+
+def test_failures_are_kept_with_their_reason_until_they_succeed(tmp_path):
+    store = LabelStore(tmp_path / "labels", SETTINGS)
+    store.partial("dark").mkdir()
+    store.fail(SequenceRecord("dark", "/recordings/dark", FAILED, reason="black frames"))
+    assert [(record.state, record.reason) for record in store.records()] == [(FAILED, "black frames")]
+    assert not store.is_done("dark")
+    finish(store, "dark")
+    assert [record.state for record in store.records()] == [DONE]
+
+
+def test_what_a_killed_run_left_is_cleared_away(tmp_path):
+    store = LabelStore(tmp_path / "labels", SETTINGS)
+    finish(store, "done")
+    leftover = store.partial("half")
+    leftover.mkdir()
+    (leftover / "label.json").write_text("{")
+    again = LabelStore(tmp_path / "labels", SETTINGS)
+    assert not leftover.exists()
+    assert again.is_done("done")
+    assert [record.name for record in again.records()] == ["done"]
+
+
+def test_other_settings_are_refused_or_start_anew(tmp_path):
+    finish(LabelStore(tmp_path / "labels", SETTINGS), "kitchen")
+    other = {**SETTINGS, "frontend": {"name": "orb", "max_keypoints": 600}}
+    with pytest.raises(ConfigError, match=r"frontend\.max_keypoints=500, now 600; .*--relabel"):
+        LabelStore(tmp_path / "labels", other)
+    assert LabelStore(tmp_path / "labels", SETTINGS).is_done("kitchen")
+    assert not LabelStore(tmp_path / "labels", other, relabel=True).is_done("kitchen")
+
+
+def test_a_folder_that_is_not_ours_is_refused(tmp_path):
+    (tmp_path / "thesis.txt").write_text("years of work")
+    with pytest.raises(OutputError, match="did not write"):
+        LabelStore(tmp_path, SETTINGS)
+
+
+def test_damaged_records_and_missing_stores_are_one_line_errors(tmp_path):
+    with pytest.raises(InputError, match="no such folder"):
+        read_records(tmp_path / "nowhere")
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "label.json").write_text("{}")
+    with pytest.raises(InputError, match="damaged"):
+        read_records(tmp_path)
+
+
+def test_names_are_unique_and_the_same_each_time(tmp_path):
+    for name in ("one/rgb", "two/rgb", "three"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "walk.mp4").write_text("")
+    paths = [tmp_path / name for name in ("one/rgb", "two/rgb", "three", "walk.mp4")]
+    names = sequence_names(paths)
+    assert list(names) == ["rgb", "two-rgb", "three", "walk"]
+    assert sequence_names(paths) == names
+    with pytest.raises(InputError, match="given twice"):
+        sequence_names([paths[0], paths[1].parent / ".." / "one" / "rgb"])
+
+
+def test_frames_round_trip(tmp_path):
+    frames = FramesTable(
+        frame=np.arange(4),
+        index=np.arange(4) * 3,
+        time=np.arange(4) / 7,
+        segment=np.array([-1, 0, 0, 1]),
+        trusted=np.array([False, True, True, False]),
+    )
+    write_frames(tmp_path / "frames.parquet", frames)
+    table = read_frames(tmp_path / "frames.parquet")
+    for name in FramesTable.__dataclass_fields__:
+        np.testing.assert_array_equal(getattr(table, name), getattr(frames, name))
+    with pytest.raises(InputError, match="cannot be read"):
+        read_frames(tmp_path / "nothing.parquet")
+
+
+def test_packed_frames_come_back_in_any_order(tmp_path, monkeypatch):
+    monkeypatch.setattr(frames_module, "_FRAMES_PER_SHARD", 8)
+    monkeypatch.setattr(frames_module, "_FRAMES_PER_GROUP", 4)
+    rows, columns = np.mgrid[:48, :64]
+    pictures = [((rows + columns + 5 * i) % 200).astype(np.uint8) for i in range(19)]
+    assert pack_images(tmp_path, iter(pictures)) == 19
+    assert len(list(tmp_path.glob("images-*.parquet"))) == 3
+    packed = PackedImages(tmp_path)
+    for frame in (0, 18, 7, 8, 3, 16):
+        difference = np.abs(packed[frame].astype(int) - pictures[frame])
+        assert np.median(difference) <= 2
+    with pytest.raises(InputError, match="--pack"):
+        PackedImages(Path(tmp_path / "elsewhere"))
