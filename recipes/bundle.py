@@ -1,0 +1,65 @@
+"""Put trained weights into the package, with what was measured: python recipes/bundle.py WEIGHTS NAME [POSE.json ...]
+
+The figures of `sivo evaluate pose` (rows of that label) go into the model card, and activation ranges over the pictures
+of --calibrate, which the int8 runtime needs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from sivo.frontend.calibration import calibrate
+from sivo.frontend.weights import BUNDLED, load_weights, save_weights
+
+ATTRIBUTION = (
+    "All frames were converted to greyscale, reduced and re-compressed. The authors of the data sets do not endorse "
+    "this work. None of the pictures is of redkitchen, hololens-office, checkerboard-desk, kitti00 or fr3-notexture, "
+    "which these weights may be judged on; icl-nuim, tartanair, tum fr3 and icsl-corridor may not be used for that."
+)
+
+
+def pose_figures(path: Path, label: str) -> dict[str, Any]:
+    """Success by estimator and gap of one frontend of a `pose.json`."""
+    figures: dict[str, Any] = {}
+    for row in json.loads(path.read_text())["rows"]:
+        if row["frontend"] == label:
+            entry = {key: row[key] for key in ("pairs", "rotation_success", "translation_success")}
+            figures.setdefault(row["estimator"], {})[str(row["gap"])] = entry
+    return figures
+
+
+def main() -> None:
+    """Write the bundled file and its card."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("weights", type=Path)
+    parser.add_argument("name", help="of the bundled weights, and the label of its rows")
+    parser.add_argument("pose", nargs="*", metavar="SEQUENCE=POSE.json")
+    parser.add_argument("--calibrate", type=Path, metavar="FOLDER", help="pictures for the int8 runtime")
+    arguments = parser.parse_args()
+    weights = load_weights(arguments.weights)
+    poses = {}
+    for entry in arguments.pose:
+        sequence, _, path = entry.partition("=")
+        poses[sequence] = pose_figures(Path(path), arguments.name)
+    training = {key: value for key, value in weights.card.metrics.items() if key != "pose"}
+    card = replace(
+        weights.card,
+        metrics={**training, **({"pose": poses} if poses else {})},
+        notes=f"The stability head is not part of these weights: only VO adaptation can teach it. {ATTRIBUTION}",
+    )
+    weights = replace(weights, card=card)
+    if arguments.calibrate:
+        files = sorted(arguments.calibrate.glob("*.jpg"))[::6]
+        weights = calibrate(weights, (cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files))
+    BUNDLED.mkdir(exist_ok=True)
+    save_weights(BUNDLED / f"{arguments.name}.safetensors", weights.tensors, weights.card)
+
+
+if __name__ == "__main__":
+    main()

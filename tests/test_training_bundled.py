@@ -1,0 +1,72 @@
+"""The bundled weights: what their cards say, and that their detectors beat the classical ones on drawn shapes."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from sivo.frontend.network import load_network_frontend
+from sivo.frontend.weights import BUNDLED, bundled_names, load_weights
+from sivo.training.precision import ScoredDetector, classical_detectors, mean_average_precision, shape_tests
+from sivo.training.settings import PhotometricSettings
+from sivo.types import Float32, UInt8
+
+NAMES = [name for name in ("superpoint", "superpoint-small") if name in bundled_names()]
+FORBIDDEN = ("redkitchen", "hololens", "checkerboard", "kitti")
+
+
+def network(name: str) -> ScoredDetector:
+    frontend = load_network_frontend(name, max_keypoints=100, threshold=0.0, border=0, precision="float32", threads=1)
+
+    def detect(image: UInt8) -> tuple[Float32, Float32]:
+        features = frontend(image)
+        return features.keypoints, features.scores
+
+    return detect
+
+
+def test_weights_are_bundled() -> None:
+    assert NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_cards_name_data_licences_and_figures(name: str) -> None:
+    path = BUNDLED / f"{name}.safetensors"
+    card = load_weights(path).card
+    assert card.architecture.name == name
+    assert card.licence == "Apache-2.0"
+    assert len(card.commit) == 40
+    assert card.training["steps"] > 0
+    assert card.training["stability_trained"] is card.architecture.stability is False
+    assert {source.licence for source in card.data} <= {"CC BY 3.0", "CC BY 4.0", "MIT", "CC0 1.0", "Apache-2.0"}
+    assert all(source.attribution for source in card.data)
+    assert not [source.name for source in card.data if any(word in source.name for word in FORBIDDEN)]
+    assert json.loads(path.with_suffix(".json").read_text())["training"]["steps"] == card.training["steps"]
+    assert path.stat().st_size < 7e6
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_detectors_beat_the_classical_ones_on_noisy_shapes(name: str) -> None:
+    tests = shape_tests(10, seed=2000, noise=PhotometricSettings())
+    ours, _ = mean_average_precision(network(name), tests)
+    for classical, detect in classical_detectors().items():
+        theirs, families = mean_average_precision(detect, tests)
+        assert len(families) == 7
+        assert 0 < theirs < ours, classical
+    assert ours > 0.15
+
+
+def test_average_precision_of_known_detections() -> None:
+    tests = shape_tests(3, seed=5)
+
+    def perfect(image: UInt8) -> tuple[Float32, Float32]:
+        corners = next(test.corners for test in tests if test.image is image)
+        return corners, corners[:, 0] + 1
+
+    def half(image: UInt8) -> tuple[Float32, Float32]:
+        corners, scores = perfect(image)
+        return corners + 50, scores
+
+    assert mean_average_precision(perfect, tests)[0] == pytest.approx(1.0)
+    assert mean_average_precision(half, tests)[0] < 0.2
