@@ -52,21 +52,22 @@ def find_keypoints(heat: Float32, settings: NetworkSettings) -> Int64:
 
 def refine(heat: Float32, pixels: Int64, radius: int) -> Float32:
     """Keypoints (N, 2): the centre of mass of the heat map in the square of `radius` around each pixel (N, 2)."""
-    padded = np.pad(heat, radius)
+    padded = cv2.copyMakeBorder(heat, radius, radius, radius, radius, cv2.BORDER_CONSTANT, value=0)
     steps = np.arange(2 * radius + 1)
-    patches = padded[pixels[:, 1, None, None] + steps[:, None], pixels[:, 0, None, None] + steps]  # (N, rows, columns)
-    mass = patches.sum(axis=(1, 2))
-    offset_x = patches.sum(axis=1) @ (steps - radius).astype(np.float32) / mass
-    offset_y = patches.sum(axis=2) @ (steps - radius).astype(np.float32) / mass
-    return (pixels + np.stack([offset_x, offset_y], axis=1)).astype(np.float32)
+    first = pixels[:, 1] * padded.shape[1] + pixels[:, 0]  # of each square, in reading order
+    square = (steps[:, None] * padded.shape[1] + steps).ravel()
+    patches = padded.ravel()[first[:, None] + square]  # (N, size of the square)
+    y, x = np.meshgrid(steps - radius, steps - radius, indexing="ij")
+    moments = patches @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1).astype(np.float32)
+    return np.asarray(pixels + moments[:, :2] / moments[:, 2:], np.float32)
 
 
 def sample_descriptors(cells: Float32, keypoints: Float32) -> Float32:
     """Unit descriptors (N, D) at keypoints (N, 2): cells (Hc, Wc, D) normalised, interpolated, normalised again."""
     corners, weights = _corners(cells, keypoints)
-    weights = weights / np.maximum(np.linalg.norm(corners, axis=2), 1e-12)
-    sampled = np.matmul(weights[:, None], corners)[:, 0]
-    return np.asarray(sampled / np.maximum(np.linalg.norm(sampled, axis=1, keepdims=True), 1e-12))
+    of_unit_corners = weights / _length(corners)
+    sampled = np.matmul(of_unit_corners[:, None], corners)[:, 0]
+    return np.asarray(sampled / _length(sampled)[:, None])
 
 
 def stability_probability(logits: Float32) -> Float32:
@@ -90,15 +91,18 @@ def _sample(cells: Float32, keypoints: Float32) -> Float32:
     return np.matmul(weights[:, None], corners)[:, 0]
 
 
+def _length(vectors: Float32) -> Float32:
+    return np.asarray(np.maximum(np.sqrt(np.einsum("...c,...c->...", vectors, vectors)), np.float32(1e-12)))
+
+
 def _corners(cells: Float32, keypoints: Float32) -> tuple[Float32, Float32]:
     """The four cells (N, 4, C) around each keypoint and their bilinear weights (N, 4); beyond the edge the edge."""
-    rows, columns = cells.shape[:2]
-    x0, x1, along_x = _neighbours(keypoints[:, 0], columns)
-    y0, y1, along_y = _neighbours(keypoints[:, 1], rows)
-    corners = cells[np.stack([y0, y0, y1, y1], axis=1), np.stack([x0, x1, x0, x1], axis=1)]
-    left, top = 1 - along_x, 1 - along_y
-    weights = np.stack([top * left, top * along_x, along_y * left, along_y * along_x], axis=1)
-    return corners, weights
+    rows, columns, channels = cells.shape
+    x0, x1, right = _neighbours(keypoints[:, 0], columns)
+    y0, y1, below = _neighbours(keypoints[:, 1], rows)
+    places = np.stack([y0 * columns + x0, y0 * columns + x1, y1 * columns + x0, y1 * columns + x1], axis=1)
+    weights = np.stack([(1 - below) * (1 - right), (1 - below) * right, below * (1 - right), below * right], axis=1)
+    return cells.reshape(-1, channels).take(places, axis=0), weights
 
 
 def _neighbours(pixels: Float32, cells: int) -> tuple[Int64, Int64, NDArray[np.float32]]:
