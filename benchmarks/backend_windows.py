@@ -44,7 +44,7 @@ class Recording:
 
 def simulated_recording(frames: int, tracks: int, seed: int, outliers: float) -> Recording:
     """Half a pixel of noise and a share of wrong observations."""
-    window = simulated_window(seed=seed, cameras=frames, points=tracks, outliers=outliers, mean_track=22.0, fixed=0)
+    window = simulated_window(seed=seed, cameras=frames, points=tracks, outliers=outliers, mean_track=30.0, fixed=0)
     problem = window.problem
     return _unit_depth(
         Recording(
