@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -195,11 +196,28 @@ def test_chart_leaves_gaps_where_there_is_nothing() -> None:
 
 def test_an_evaluation_page_has_its_tables_and_meaning(tmp_path: Path) -> None:
     (tmp_path / "vo.json").write_text('{"rows": [1]}')
-    (tmp_path / "vo.md").write_text("# Table\n\n| a | b |\n|---|--:|\n| sift | **.5** |\n")
+    (tmp_path / "vo.md").write_text("# Table\n\n- one < two\n\n| a | b |\n|---|--:|\n| sift | **.5** |\n")
     assert main(["report", str(tmp_path)]) == 0
     text = (tmp_path / "report.html").read_text()
     assert "<td><b>.5</b></td>" in text
+    assert "<li>one &lt; two</li>" in text
     assert "with and without stability" in text
+
+
+def test_a_run_without_any_pose_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images = tmp_path / "still"
+    images.mkdir()
+    picture = np.random.default_rng(0).integers(0, 255, (120, 160)).astype(np.uint8)
+    for number in range(5):
+        cv2.imwrite(str(images / f"{number}.png"), picture)
+    out = tmp_path / "out"
+    assert main(["run", str(images), "-o", str(out), "--fov", "60", "--frontend", "orb", "--report"]) == 0
+    text = (out / "report.html").read_text()
+    assert "No frame has a pose" in text
+    assert 'id="frame-slider"' in text
+    assert 'id="scene"' not in text
+    assert main(["show", "map", str(out)]) == 2
+    assert "no map to draw" in capsys.readouterr().err
 
 
 def test_a_folder_without_results_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -78,11 +78,14 @@ class Page:
         )
 
     def markdown(self, text: str) -> None:
-        """Our own Markdown subset: headings, paragraphs and tables, as the evaluations print them."""
+        """Our own Markdown subset: headings, paragraphs, lists and tables, as the evaluations print them."""
         for block in re.split(r"\n\s*\n", text.strip()):
             lines = block.strip().splitlines()
             table = [line for line in lines if line.lstrip().startswith("|")]
-            rest = [line for line in lines if line not in table]
+            items = [line for line in lines if line.startswith("- ")]
+            rest = [line for line in lines if line not in table and line not in items]
+            if items:
+                self.html("<ul>" + "".join(f"<li>{_cell(item[2:])}</li>" for item in items) + "</ul>")
             for line in rest:
                 if line.startswith("#"):
                     self.html(f"<h3>{escape(line.lstrip('# '))}</h3>")

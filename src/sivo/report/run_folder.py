@@ -78,7 +78,9 @@ class RunFolder:
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """Poses of the frames that have one."""
+        """Poses of the frames that have one, maybe none."""
+        if self.report["frames"]["tracked"] == 0:  # a file without poses is otherwise an error
+            return Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
         return read_trajectory(self.path / "trajectory.txt")
 
     @cached_property
