@@ -85,6 +85,7 @@ def test_commands_and_their_options_exist(page: str) -> None:
     reason="needs MkDocs: pip install 'sivo[docs]'",
 )
 def test_site_builds_without_a_warning(tmp_path: Path) -> None:
+    pages = sorted((ROOT / "docs").glob("*.md"))
     build = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(tmp_path / "site")],
         cwd=ROOT,
@@ -97,6 +98,6 @@ def test_site_builds_without_a_warning(tmp_path: Path) -> None:
     commands = (tmp_path / "site" / "commands" / "index.html").read_text()
     assert "usage: sivo run" in commands
     assert "usage: sivo export colmap" in commands
-    for page in sorted((ROOT / "docs").glob("*.md")):
+    for page in pages:
         name = "" if page.stem == "index" else page.stem
         assert (tmp_path / "site" / name / "index.html").is_file(), page

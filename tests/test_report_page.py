@@ -16,6 +16,7 @@ import pytest
 
 from sivo.cli.main import main
 from sivo.report.charts import line_chart
+from sivo.report.improvement_page import Measure, Round, write_improvement_page
 from sivo.report.page import Page
 from sivo.report.plain_words import ranges, warnings
 
@@ -240,3 +241,25 @@ def test_a_label_store_has_a_page_with_what_failed_and_why(finished_run: Path, t
     assert "still has no labels" in text
     assert text.count("data:image/png") == 1
     assert main(["report", str(labels / "walk"), "-o", str(tmp_path / "one.html")]) == 0
+
+
+def test_improvement_is_told_with_its_setbacks(tmp_path: Path) -> None:
+    measures = [
+        Measure("success", "share of pairs", digits=2),
+        Measure("error", "pixels", larger_is_better=False, digits=2),
+    ]
+    rounds = [
+        Round("before", {"success": 0.61, "error": 0.50}, {"stable": 1200}, {"label": 3.0}),
+        Round("round 1", {"success": 0.70, "error": 0.47}, {"stable": 1500, "unstable": 90}),
+        Round("round 2", {"success": 0.74, "error": 0.58}),
+    ]
+    write_improvement_page(tmp_path / "page.html", "Improvement", "superpoint on <one> video", measures, rounds)
+    text = (tmp_path / "page.html").read_text()
+    assert "0.61 → 0.74" in text
+    assert "<b>0.74</b>" in text
+    assert "<b>0.47</b>" in text
+    assert "<b>0.58</b>" not in text
+    assert "Worse than before: error, 0.50 → 0.58." in text
+    assert "Worse than before: success" not in text
+    assert text.count("<polyline") == 2
+    assert "&lt;one&gt;" in text
