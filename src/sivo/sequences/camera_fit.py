@@ -118,10 +118,9 @@ def fit_camera(views: list[View], size: tuple[int, int], model: str = "auto") ->
     fits = {name: fit for name in names if (fit := _solve(views, size, name)) is not None}
     if not fits:
         raise InputError("no camera explains these views of the board; check the corner count of --board")
-    best = next(iter(fits))
-    for name, fit in fits.items():
-        if fit.rms < _SIMPLER * fits[best].rms:
-            best = name
+    simplest = next(iter(fits))
+    best = min(fits, key=lambda name: fits[name].rms)
+    best = best if fits[best].rms < _SIMPLER * fits[simplest].rms else simplest
     fit = fits[best]
     _refuse_undetermined(fit)
     tried = {name: one.rms for name, one in fits.items()}
