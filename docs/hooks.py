@@ -1,14 +1,17 @@
-"""MkDocs hooks: pages that the navigation does not name, and the options of every command."""
+"""MkDocs hooks: pages that the navigation does not name, the options of every command, and the model cards."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
 import io
+import json
 from pathlib import Path
 from typing import Any
 
 _OPTIONS_HERE = "<!-- options of all commands -->"
+_CARDS_HERE = "<!-- model cards -->"
+_WEIGHTS = Path(__file__).parents[1] / "src" / "sivo" / "frontend" / "weights"
 
 
 def on_config(config: Any) -> Any:
@@ -22,8 +25,11 @@ def on_config(config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Put what `sivo VERB --help` prints where a page asks for it."""
-    return markdown.replace(_OPTIONS_HERE, "\n".join(_help_texts())) if _OPTIONS_HERE in markdown else markdown
+    """Put what `sivo VERB --help` prints, and the cards of the bundled weights, where a page asks for them."""
+    for mark, lines in ((_OPTIONS_HERE, _help_texts), (_CARDS_HERE, _model_cards)):
+        if mark in markdown:
+            markdown = markdown.replace(mark, "\n".join(lines()))
+    return markdown
 
 
 def _pages(nav: Any) -> list[str]:
@@ -56,3 +62,37 @@ def _subcommands(verb: str) -> list[str]:
     importlib.import_module(f"sivo.cli.{COMMANDS[verb][0]}").add_arguments(parser)
     actions = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
     return [name for action in actions for name in action.choices]
+
+
+def _model_cards() -> list[str]:
+    lines = []
+    for file in sorted(_WEIGHTS.glob("*.json")):
+        card = json.loads(file.read_text())
+        network = card["architecture"]
+        lines += [
+            f"## `{file.stem}`",
+            "",
+            f"Encoder {'-'.join(map(str, network['encoder']))}, heads {network['head']}, descriptor "
+            f"{network['descriptor']}-D, {'with' if network['stability'] else 'without'} a stability head. "
+            f"Licence of the weights: {card['licence']}. "
+            + ("Calibrated for int8." if card["activation_ranges"] else "Runs in float32."),
+            "",
+            card["notes"],
+            "",
+            "| data | licence | attribution |",
+            "|---|---|---|",
+            *(f"| {entry['name']} | {entry['licence']} | {entry['attribution']} |" for entry in card["data"]),
+            "",
+            '??? note "Training and last metrics"',
+            "",
+            "    ```json",
+            *(f"    {line}" for line in _indented(card)),
+            "    ```",
+            "",
+        ]
+    return lines
+
+
+def _indented(card: dict[str, Any]) -> list[str]:
+    kept = {name: card[name] for name in ("training", "metrics", "commit")}
+    return json.dumps(kept, indent=2).splitlines()

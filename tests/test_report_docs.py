@@ -98,6 +98,9 @@ def test_site_builds_without_a_warning(tmp_path: Path) -> None:
     commands = (tmp_path / "site" / "commands" / "index.html").read_text()
     assert "usage: sivo run" in commands
     assert "usage: sivo export colmap" in commands
+    models = (tmp_path / "site" / "models" / "index.html").read_text()
+    for card in (ROOT / "src" / "sivo" / "frontend" / "weights").glob("*.json"):
+        assert f"<code>{card.stem}</code>" in models
     for page in pages:
         name = "" if page.stem == "index" else page.stem
         assert (tmp_path / "site" / name / "index.html").is_file(), page

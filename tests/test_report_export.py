@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from sivo.cli.main import main
+from sivo.labeling.tables import read_tracks
 from sivo.report.model import segment_model
 from sivo.report.run_folder import RunFolder, read_map
 from sivo.report.trajectory_export import export_trajectory
@@ -144,3 +149,49 @@ def test_viewer_without_rerun_names_the_extra(
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert main(["show", "live", str(finished_run)]) == 2
     assert "pip install 'sivo[view]'" in capsys.readouterr().err
+
+
+def in_two_segments(finished: Path, folder: Path) -> Path:
+    """A copy of a run whose second half claims to be another segment."""
+    shutil.copytree(finished, folder)
+    lines = (folder / "trajectory.txt").read_text().splitlines(keepends=True)
+    lines.insert(2 + 18, "# segment 1: has its own world frame and scale\n")
+    (folder / "trajectory.txt").write_text("".join(lines))
+    report = json.loads((folder / "run.json").read_text())
+    report["segments"].append({**report["segments"][0], "number": 1, "first": 18})
+    (folder / "run.json").write_text(json.dumps(report))
+    points = pq.read_table(folder / "points.parquet")
+    tracks = read_tracks(folder / "tracks.parquet")
+    later = set(tracks.track[tracks.frame >= 18].tolist()) - set(tracks.track[tracks.frame < 18].tolist())
+    segment = [int(track in later) for track in points["track"].to_pylist()]
+    column = points.schema.get_field_index("segment")
+    points = points.set_column(column, points.schema.field(column), pa.array(segment, pa.int32()))
+    pq.write_table(points, folder / "points.parquet")
+    return folder
+
+
+def test_segments_are_models_of_their_own_the_longest_first(
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = in_two_segments(finished_run, tmp_path / "run")
+    assert main(["export", "colmap", str(run), "-o", str(tmp_path / "c"), "--no-images"]) == 0
+    images = [(tmp_path / "c" / "sparse" / name / "images.txt").read_text() for name in ("0", "1")]
+    assert [text.count(".png") for text in images] == [18, 12]
+    assert "frame_000017.png" in images[0]
+    assert "frame_000018.png" in images[1]
+    assert not (tmp_path / "c" / "images").exists()
+    capsys.readouterr()
+    assert main(["export", "nerfstudio", str(run), "-o", str(tmp_path / "n")]) == 0
+    assert "only the longest of 2 segments: 12 frames" in capsys.readouterr().out
+    assert main(["show", "map", str(run)]) == 0
+    assert main(["report", str(run)]) == 0
+    assert "2 pieces (new ones start at frames 18)" in (run / "report.html").read_text()
+
+
+def test_an_export_does_not_touch_a_folder_of_others(
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    assert main(["export", "colmap", str(finished_run), "-o", str(tmp_path)]) == 2
+    assert "choose an empty or new output folder" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
