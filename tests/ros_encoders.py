@@ -7,6 +7,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
+
+pytest.importorskip("rosbags")
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -114,6 +115,21 @@ def test_sens_header_that_lies_about_counts_and_sizes(tmp_path: Path) -> None:
     lying[sizes - 8 : sizes - 4] = struct.pack("<i", 7)
     path.write_bytes(lying)
     assert "colour compression 7" in refused(path)
+
+
+def test_sens_of_20000_frames_opens_at_once(tmp_path: Path) -> None:
+    """It hops from header to header: time is bounded, and no picture is decoded."""
+    data = encoders.write_sens(tmp_path / "s.sens", scene(), claimed=20_000).read_bytes()
+    first = data.index(struct.pack("<fQ", 1000.0, 20_000)) + 12
+    colour, depth = struct.unpack_from("<2Q", data, first + 80)
+    frame = data[first : first + 96 + colour + depth]
+    frames = (frame[:64] + struct.pack("<2Q", 40_000 * i, 40_000 * i) + frame[80:] for i in range(1, 20_001))
+    (tmp_path / "long.sens").write_bytes(data[:first] + b"".join(frames))
+    start = time.process_time()
+    sequence = open_sequence(tmp_path / "long.sens")
+    assert time.process_time() - start < 1.0
+    assert len(sequence) == 20_000
+    assert sequence[19_999].time == pytest.approx(800.0)
 
 
 def test_sens_frame_that_cannot_be_decoded_is_skipped(tmp_path: Path) -> None:

@@ -48,6 +48,20 @@ def test_tum_associates_depth_and_truth_by_time(tmp_path: Path) -> None:
     assert any("1 of 7 images have no depth" in note for note in sequence.notes)
 
 
+@pytest.mark.parametrize("swapped", [False, True])
+def test_tum_with_an_association_file(tmp_path: Path, swapped: bool) -> None:
+    write_tum(tmp_path)
+    lists = [(tmp_path / name).read_text().splitlines()[1:] for name in ("rgb.txt", "depth.txt")]
+    rows = [f"{b} {a}" if swapped else f"{a} {b}" for a, b in zip(*lists, strict=True)]
+    (tmp_path / "associations.txt").write_text("\n".join(rows))
+    (tmp_path / "rgb.txt").unlink()
+    (tmp_path / "depth.txt").unlink()
+    sequence = open_sequence(tmp_path)
+    assert (sequence.format, len(sequence)) == ("tum", COUNT)
+    assert (sequence[3].image == images(COUNT)[3]).all()
+    np.testing.assert_array_equal(sequence.depth(3), depths(COUNT)[3])
+
+
 def test_truth_between_stamps_is_interpolated(tmp_path: Path) -> None:
     write_images(tmp_path, images(3))
     (tmp_path / "camera.yaml").write_text(calibration_yaml(CAMERA))

@@ -67,9 +67,9 @@ def write_coverage(path: Path, fit: CameraFit) -> None:
         opposite = ((column + 1) * camera.width // columns, (row + 1) * camera.height // rows)
         cv2.rectangle(canvas, corner, opposite, (225, 225, 225), cv2.FILLED)
     radius = max(1, camera.width // 320)
-    worst = max(float(fit.view_errors.max()), 1e-9)
+    worst = max(1.0, 3 * float(np.median(fit.view_errors)))  # pixels; anything below one is fine
     for view, error in zip(fit.views, fit.view_errors.tolist(), strict=False):
-        share = error / worst
+        share = min(1.0, error / worst)
         colour = (0, round(170 * (1 - share)), round(230 * share))
         for x, y in np.rint(view.pixels).astype(int).tolist():
             cv2.circle(canvas, (x, y), radius, colour, cv2.FILLED, cv2.LINE_AA)

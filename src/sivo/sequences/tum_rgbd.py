@@ -32,19 +32,20 @@ _PUBLISHED = {  # the data set's page, "Intrinsic Camera Calibration of the Kine
 
 
 class TumRgbd(Recording):
-    """A folder with `rgb.txt`."""
+    """A folder with `rgb.txt`, or with the `associations.txt` that other tools make of both lists."""
 
     format = "tum"
 
     def __init__(self, path: Path, settings: SequenceSettings) -> None:
         self.path = path
-        self.times, self._images, notes = read_file_list(path / "rgb.txt")
+        pairs = None if (path / "rgb.txt").is_file() else _pairs_file(path)
+        self.times, self._images, notes = _read_list(pairs or path / "rgb.txt", "rgb")
         self.calibration = folder_calibration(path) or _published(path)
         self._scale = (self.calibration and self.calibration.depth_scale) or DEPTH_SCALE
         self._depth: list[Path] = []
         self._depth_row = np.full(len(self.times), -1, np.int64)
-        if (path / "depth.txt").is_file():
-            depth_times, self._depth, depth_notes = read_file_list(path / "depth.txt")
+        if pairs is not None or (path / "depth.txt").is_file():
+            depth_times, self._depth, depth_notes = _read_list(pairs or path / "depth.txt", "depth")
             self._depth_row = nearest(self.times, depth_times)
             notes += depth_notes
             without = int((self._depth_row < 0).sum())
@@ -57,7 +58,7 @@ class TumRgbd(Recording):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        return (path / "rgb.txt").is_file()
+        return (path / "rgb.txt").is_file() or (path.is_dir() and _pairs_file(path) is not None)
 
     def source(self, index: int) -> str:
         return str(self._images[index])
@@ -70,8 +71,14 @@ class TumRgbd(Recording):
         return None if row < 0 else read_depth(self._depth[row], self._scale)
 
 
-def read_file_list(path: Path) -> tuple[Float64, list[Path], list[str]]:
-    """Times (N,), increasing, and files of an `rgb.txt`, with one note for each kind of bad row.
+def _pairs_file(path: Path) -> Path | None:
+    """The list of `time rgb/file time depth/file` rows, in either order."""
+    names = ("associations.txt", "associate.txt", "associated.txt", "association.txt", "assoc.txt")
+    return next((path / name for name in names if (path / name).is_file()), None)
+
+
+def _read_list(path: Path, kind: str) -> tuple[Float64, list[Path], list[str]]:
+    """Times (N,), increasing, and files of an `rgb.txt` or of the `kind` in a list of pairs; notes on bad rows.
 
     Raises:
         InputError: the file cannot be read or has no row `timestamp filename`.
@@ -80,11 +87,14 @@ def read_file_list(path: Path) -> tuple[Float64, list[Path], list[str]]:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read ({error}); it must list `timestamp filename` rows") from None
+    in_pairs = path.name != f"{kind}.txt"
     times, files, bad = [], [], 0
     for line in lines:
-        fields = line.replace(",", " ").split(maxsplit=1)
+        fields = line.replace(",", " ").split() if in_pairs else line.replace(",", " ").split(maxsplit=1)
         if not fields or fields[0].startswith("#"):
             continue
+        if len(fields) == 4 and fields[3].split("/")[0] == kind:
+            fields = fields[2:4]
         try:
             time = float(fields[0])
         except ValueError:
