@@ -158,3 +158,19 @@ def test_kernels_compile_ahead_of_time():
     assert kernels_are_cached()
     compile_kernels(said.append)
     assert said == []
+
+
+def test_kernels_work_where_nothing_can_be_cached(monkeypatch):
+    from numba import njit
+
+    from sivo.backend import compiled as module
+
+    def no_writable_folder(**options):
+        if options.pop("cache", False):
+            raise RuntimeError("cannot cache function: no locator available")
+        return njit(**options)
+
+    monkeypatch.setattr(module, "njit", no_writable_folder)
+    double = module.compiled(lambda x: 2.0 * x)
+    assert double(4.0) == 8.0
+    assert double.stats.cache_path is None

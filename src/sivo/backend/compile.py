@@ -19,7 +19,11 @@ def kernels_are_cached() -> bool:
     from sivo.backend import reduced, triangulation_kernels
 
     kernels = (reduced.solve_step, triangulation_kernels.triangulate_all)
-    return all(any(Path(kernel.stats.cache_path).glob(f"*{kernel.__name__}-*.nbi")) for kernel in kernels)
+    folders = [kernel.stats.cache_path for kernel in kernels]  # None where nothing can be cached
+    return all(
+        folder is not None and any(Path(folder).glob(f"*{kernel.__name__}-*.nbi"))
+        for kernel, folder in zip(kernels, folders, strict=True)
+    )
 
 
 def compile_kernels(progress: Callable[[str], None] | None = None) -> None:

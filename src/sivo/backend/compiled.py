@@ -8,7 +8,26 @@ calls becomes part of it, so after an edit of the callee touch the file of the c
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 from numba import njit
 
-compiled = njit(cache=True, nogil=True, error_model="numpy")
-inlined = njit(cache=True, nogil=True, error_model="numpy", inline="always")
+_OPTIONS = {"nogil": True, "error_model": "numpy"}
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """A kernel: compiled when it is first called."""
+    return _jit(function)
+
+
+def inlined(function: Callable[..., Any]) -> Any:
+    """A small part of kernels that becomes part of its callers before they are compiled."""
+    return _jit(function, inline="always")
+
+
+def _jit(function: Callable[..., Any], **options: Any) -> Any:
+    try:
+        return njit(cache=True, **_OPTIONS, **options)(function)
+    except RuntimeError:  # neither the package's folder nor the user's cache can be written: compile each time
+        return njit(**_OPTIONS, **options)(function)

@@ -156,7 +156,7 @@ def _failure(job: LabelJob, error: Exception) -> SequenceRecord:
     """What the manifest says of a sequence that could not be labelled."""
     if not isinstance(error, SivoError | OSError):
         logger.error("labelling %s failed unexpectedly", job.path, exc_info=error)
-        error = InputError(f"{job.path}: unexpected {type(error).__name__}: {str(error).splitlines()[0:1]}")
+        error = InputError(f"{job.path}: unexpected {type(error).__name__}: {' '.join(str(error).split())}")
     return replace(SequenceRecord(job.name, str(job.path), FAILED), reason=str(error))
 
 
