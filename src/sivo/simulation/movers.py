@@ -65,7 +65,7 @@ def swinging_lamp(shop: Workshop, position: tuple[float, float], ceiling: float,
     builder.lathe(node, shade, (0, 0, 0), palette.label())
     glow = builder.material(None, colour=(1.0, 0.95, 0.8), emission=1.0, shine=0.0)
     builder.ellipsoid(node, (0.05, 0.05, 0.06), (0, 0, -cord - 0.13), glow)
-    builder.light(node, (0, 0, -cord - 0.23), (0, 0, -1), strength, shadow=True, cutoff=72)
+    builder.light(node, (0, 0, -cord - 0.23), (0, 0, -1), strength, shadow=True, cutoff=62)
 
 
 def drawer_motion(rng: np.random.Generator) -> Callable[[float], float]:

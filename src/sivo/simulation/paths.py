@@ -40,23 +40,19 @@ def floor_path(rng: np.random.Generator, floor: Floor, clearance: float, speed: 
         ConfigError: the room is too full for one.
     """
     half = np.array([floor.width, floor.length]) / 2
-    angles = np.linspace(0, 2 * np.pi, 121)
-    best: tuple[float, float, Float64] | None = None  # clearance that counts, length, points
-    for _ in range(500):
-        waves = np.arange(1, 4)
-        wobble = 1 + (rng.uniform(0, 0.2, 3) * np.cos(angles[:, None] * waves + rng.uniform(0, 2 * np.pi, 3))).sum(
-            axis=1
-        )
-        reach = rng.uniform(0.15, 0.75, 2) * half
-        centre = rng.uniform(-0.6, 0.6, 2) * half
-        points = centre + reach * np.column_stack([wobble * np.cos(angles), wobble * np.sin(angles)])
-        length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-        least = min(float(floor.clearance(points).min()), clearance)
-        if best is None or (least, length) > best[:2]:
-            best = (least, length, points)
-    if best is None or best[0] < 0.08:
+    angles = np.linspace(0, 2 * np.pi, 97)
+    tries, waves = 500, np.arange(1, 4)
+    size, phase = rng.uniform(0, 0.2, (tries, 1, 3)), rng.uniform(0, 2 * np.pi, (tries, 1, 3))
+    wobble = 1 + (size * np.cos(angles[:, None] * waves + phase)).sum(axis=2)
+    loops = np.stack([wobble * np.cos(angles), wobble * np.sin(angles)], axis=-1)
+    loops *= (rng.uniform(0.15, 0.75, (tries, 2)) * half)[:, None]
+    loops += (rng.uniform(-0.6, 0.6, (tries, 2)) * half)[:, None]
+    lengths = np.linalg.norm(np.diff(loops, axis=1), axis=2).sum(axis=1)
+    least = np.minimum(floor.clearance(loops).min(axis=1), clearance)
+    best = int(np.lexsort((lengths, least))[-1])  # room to walk first, then the longest
+    if least[best] < 0.08:
         raise ConfigError("the room is too full for a path; use fewer pieces of `furniture` or a larger `room_size`")
-    dense = best[2][:: -1 if rng.uniform() < 0.5 else 1]
+    dense = loops[best][:: -1 if rng.uniform() < 0.5 else 1].copy()
     steps = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(dense, axis=0), axis=1))])
     dense[-1] = dense[0]
     spline = CubicSpline(steps, dense, bc_type="periodic")

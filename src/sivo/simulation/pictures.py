@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from sivo.simulation.textures import SIZE, blend, carpet, cloud, colour, rgb
 from sivo.types import UInt8
@@ -78,15 +79,11 @@ def printed_page(rng: np.random.Generator) -> UInt8:
 def mosaic(rng: np.random.Generator) -> UInt8:
     """A poster of random coloured cells."""
     seeds = rng.uniform(0, SIZE, (90, 2)).astype(np.float32)
-    y, x = np.mgrid[:SIZE, :SIZE].astype(np.float32)
-    nearest = np.zeros((SIZE, SIZE), np.int64)
-    least = np.full((SIZE, SIZE), np.inf, np.float32)
-    for number, (seed_x, seed_y) in enumerate(seeds):
-        distance = (x - seed_x) ** 2 + (y - seed_y) ** 2
-        nearest[distance < least] = number
-        least = np.minimum(least, distance)
+    y, x = np.mgrid[:SIZE:2, :SIZE:2].astype(np.float32)
+    _, cells = cKDTree(seeds).query(np.stack([x.ravel(), y.ravel()], axis=1))
+    nearest = cv2.resize(cells.reshape(x.shape).astype(np.uint8), (SIZE, SIZE), interpolation=cv2.INTER_NEAREST)
     palette = np.array([colour(rng, (0.1, 0.9), (0.2, 1.0)) for _ in seeds])
-    edges = cv2.morphologyEx(nearest.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
+    edges = cv2.morphologyEx(nearest, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
     image = palette[nearest].astype(np.uint8)
     image[edges] = 20
     return image

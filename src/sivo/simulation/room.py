@@ -23,14 +23,14 @@ class Floor:
     obstacles: list[Rectangle] = field(default_factory=list)
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """Distance (N,) of floor points (N, 2) from walls and furniture; negative inside."""
+        """Distance (...) of floor points (..., 2) from walls and furniture; negative inside."""
         half = np.array([self.width, self.length]) / 2
-        least = (half - np.abs(points)).min(axis=1)
+        least = (half - np.abs(points)).min(axis=-1)
         for x0, y0, x1, y1 in self.obstacles:
-            outside = np.maximum(np.maximum([x0, y0] - points, points - [x1, y1]), 0)
-            inside = np.minimum(np.minimum(points - [x0, y0], [x1, y1] - points).min(axis=1), np.inf)
-            distance = np.linalg.norm(outside, axis=1)
-            least = np.minimum(least, np.where(distance > 0, distance, -inside))
+            x = np.maximum(x0 - points[..., 0], points[..., 0] - x1)
+            y = np.maximum(y0 - points[..., 1], points[..., 1] - y1)
+            outside = np.hypot(np.maximum(x, 0), np.maximum(y, 0))
+            least = np.minimum(least, outside + np.minimum(np.maximum(x, y), 0))
         return np.asarray(least)
 
 

@@ -15,7 +15,7 @@ from sivo.simulation.paths import CameraPath, FloorPath, floor_path
 from sivo.simulation.room import Floor, furnish
 from sivo.simulation.settings import SimulationSettings
 
-_TOO_NEAR = 0.75  # metres between the camera and a walker
+_TOO_NEAR = 1.4  # metres between the camera and a walker
 _IN_VIEW = 0.4  # share of the time that a walker is in view
 
 
@@ -67,7 +67,7 @@ def _apart(
                 best = (*score, path)
         if best and best[:2] == (_TOO_NEAR, _IN_VIEW):
             break
-    if best is None or best[0] < 0.4:
+    if best is None or best[0] < 0.6:
         raise ConfigError("no room for a walker beside the camera; use fewer `walkers`, fewer frames or another seed")
     return best[2]
 
@@ -78,8 +78,8 @@ def _lights(shop: Workshop, floor: Floor, settings: SimulationSettings) -> None:
     x, y = pick(rng, (-0.2, 0.2)) * floor.width, pick(rng, (0.1, 0.3)) * floor.length * float(rng.choice([-1, 1]))
     glow = builder.material(None, colour=(1.0, 0.97, 0.9), emission=1.0, shine=0.0)
     builder.lathe(builder.world, [(0.0, -0.06), (0.16, -0.05), (0.18, 0.0)], (x, y, height), glow)
-    builder.light(builder.world, (x, y, height - 0.1), (0, 0, -1), 0.7 * settings.brightness, shadow=True, cutoff=84)
+    builder.light(builder.world, (x, y, height - 0.1), (0, 0, -1), 0.55 * settings.brightness, shadow=True, cutoff=70)
     builder.light(builder.world, (-x, -y, 1.2), (0, 0, 1), 0.55 * settings.brightness, shadow=False, cutoff=180)
     builder.light(builder.world, (x, -y, 1.4), (0, 0, -1), 0.55 * settings.brightness, shadow=False, cutoff=180)
     if settings.swinging_lamp:
-        swinging_lamp(shop, (-x, -y), height, 0.45 * settings.brightness)
+        swinging_lamp(shop, (-x, -y), height, 0.38 * settings.brightness)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Callable
+from functools import cache
 
 import cv2
 import numpy as np
@@ -33,12 +34,27 @@ def cloud(rng: np.random.Generator, octaves: int = 6, size: int = SIZE, first: i
         if cells * aspect > size:
             break
         grid = rng.uniform(-1, 1, (cells * aspect, cells)).astype(np.float32)
-        padded = np.pad(grid, 2, mode="wrap")
-        scale_y, scale_x = size // (cells * aspect), size // cells
-        large = cv2.resize(padded, None, fx=scale_x, fy=scale_y, interpolation=cv2.INTER_CUBIC)
-        total += 0.55**octave * large[2 * scale_y : 2 * scale_y + size, 2 * scale_x : 2 * scale_x + size]
+        total += 0.55**octave * (_periodic_cubic(cells * aspect, size) @ grid @ _periodic_cubic(cells, size).T)
     total -= total.min()
     return np.asarray(total / max(float(total.max()), 1e-6), np.float32)
+
+
+@cache
+def _periodic_cubic(cells: int, size: int) -> Float32:
+    """Weights (size, cells) of Catmull-Rom interpolation of a periodic signal."""
+    place = np.arange(size) * cells / size
+    whole = np.floor(place).astype(int)
+    t = place - whole
+    weights = np.zeros((size, cells), np.float32)
+    taps = (
+        0.5 * (-(t**3) + 2 * t**2 - t),
+        0.5 * (3 * t**3 - 5 * t**2 + 2),
+        0.5 * (-3 * t**3 + 4 * t**2 + t),
+        0.5 * (t**3 - t**2),
+    )
+    for offset, weight in zip((-1, 0, 1, 2), taps, strict=True):
+        np.add.at(weights, (np.arange(size), (whole + offset) % cells), weight)
+    return weights
 
 
 def blend(amount: Float32, low: Float32, high: Float32) -> UInt8:
