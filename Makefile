@@ -16,6 +16,9 @@ lint: $(VENV)/.dev-installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+docs: $(VENV)/.dev-installed
+	$(BIN)/mkdocs build --strict
+
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
@@ -27,6 +30,7 @@ $(VENV)/.run-installed: $(VENV)/bin/python pyproject.toml
 $(VENV)/.dev-installed: $(VENV)/bin/python pyproject.toml
 	$(BIN)/pip install --quiet torch==2.13.0
 	$(BIN)/pip install --quiet -e '.[dev]'
+	$(BIN)/pip install --quiet evo  # GPL: the tests run its commands beside us to compare figures; never imported
 	touch $@ $(VENV)/.run-installed
 
 clean:

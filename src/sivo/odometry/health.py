@@ -19,7 +19,7 @@ from sivo.odometry.local_map import poselib_camera
 from sivo.odometry.settings import HealthSettings
 from sivo.odometry.view import View
 from sivo.tracking.matching import match_units
-from sivo.types import Float64
+from sivo.types import Float64, Int64
 
 _FEATURES = 600  # the strongest of each view; all of them would only cost time
 
@@ -45,7 +45,7 @@ class HealthCheck:
         self._settings = settings
         self._descriptor_distance = descriptor_distance
         self._seed = seed
-        self._rounds: deque[tuple[int, int]] = deque(maxlen=settings.rounds)
+        self._rounds: deque[Int64] = deque(maxlen=settings.rounds)  # of (gaps, 2) map and own inliers
 
     def contradicts(self, view: View, earlier: Mapping[int, View]) -> bool:
         """Whether the last checks together say that the map is wrong.
@@ -57,20 +57,30 @@ class HealthCheck:
         settings = self._settings
         if view.position % settings.interval:
             return False
-        pairs = [earlier[view.position - gap] for gap in settings.gaps if view.position - gap in earlier]
-        found = [
-            agreement(a, view, self._camera, self._descriptor_distance, settings.epipolar_error, self._seed)
-            for a in pairs
-        ]
-        sure = [
-            each
-            for each in found
-            if each.own_inliers >= max(settings.min_inliers, settings.min_inlier_share * each.matches)
-        ]
-        self._rounds.append((sum(each.map_inliers for each in sure), sum(each.own_inliers for each in sure)))
-        map_inliers, own_inliers = (sum(counts) for counts in zip(*self._rounds, strict=True))
-        enough = len(self._rounds) == settings.rounds and own_inliers >= settings.min_evidence
-        return enough and map_inliers < settings.min_agreement * own_inliers
+        counts = np.zeros((len(settings.gaps), 2), np.int64)
+        for row, gap in enumerate(settings.gaps):
+            if view.position - gap not in earlier:
+                continue
+            found = agreement(
+                earlier[view.position - gap],
+                view,
+                self._camera,
+                self._descriptor_distance,
+                settings.epipolar_error,
+                self._seed,
+            )
+            if found.own_inliers >= max(settings.min_inliers, settings.min_inlier_share * found.matches):
+                counts[row] = found.map_inliers, found.own_inliers
+        self._rounds.append(counts)
+        if len(self._rounds) < settings.rounds:
+            return False
+        map_inliers, own_inliers = np.sum(self._rounds, axis=0).T  # (gaps,) each
+        together = own_inliers.sum() >= settings.min_evidence and (
+            map_inliers.sum() < settings.min_agreement * own_inliers.sum()
+        )
+        # drift of the map shows between the views farthest apart, which the many matches of near ones would drown
+        one_gap = (own_inliers >= settings.min_evidence) & (map_inliers < settings.min_agreement_of_gap * own_inliers)
+        return bool(together or one_gap.any())
 
 
 def agreement(
