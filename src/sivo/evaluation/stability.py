@@ -1,7 +1,9 @@
 """How well instability finds its true cause, on simulated recordings: of labels, and of a stability head.
 
 The positives are moving things and highlights (the headline), all causes together, and every cause by itself; the
-negatives are always the points that nothing speaks against.
+negatives are the points on static surfaces that nothing speaks against. Of tracks it is also known, from true poses and
+depth, which of those left their surface point: wrong links make a track unstable whatever it lies on. They are a row of
+their own, and every measure is given against all static points and against those that were followed.
 """
 
 from __future__ import annotations
@@ -17,9 +19,11 @@ from numpy.typing import NDArray
 
 from sivo.errors import InputError
 from sivo.evaluation.causes import PRECEDENCE, TrueCauses, track_causes
+from sivo.evaluation.true_errors import true_track_errors
 from sivo.types import Float64
 
 HEADLINE = ("moving", "highlight")
+STRAYED = 5.0  # pixels from its true place, at which a track on a static surface counts as wrongly linked
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,7 @@ class Judged:
     scores: dict[str, Float64]  # name -> (N,), larger is less stable
     called_unstable: NDArray[np.bool_]  # (N,)
     total: NDArray[np.int64]  # (len(PRECEDENCE),) points per cause, also those without a label
+    true_error: Float64  # (N,) pixels, see `true_track_errors`; NaN where unknown
 
     @staticmethod
     def joined(parts: Iterable[Judged]) -> Judged:
@@ -40,6 +45,7 @@ class Judged:
             {name: np.concatenate([item.scores[name] for item in items]) for name in items[0].scores},
             np.concatenate([item.called_unstable for item in items]),
             np.sum([item.total for item in items], axis=0),
+            np.concatenate([item.true_error for item in items]),
         )
 
 
@@ -78,13 +84,13 @@ def judge_labels(labels: Path, simulation: Path) -> Judged:
     """
     from sivo.labeling.stability import IGNORE, UNSTABLE
     from sivo.labeling.tables import POINTS_FILE, TRACKS_FILE, read_points, read_tracks
+    from sivo.sequences import open_sequence
 
     truth = TrueCauses(simulation)
     points, tracks = read_points(labels / POINTS_FILE), read_tracks(labels / TRACKS_FILE)
-    source_index, width = _processed(labels, int(tracks.frame.max(initial=-1)) + 1, truth)
-    ids, causes = track_causes(
-        truth, tracks.frame.astype(np.int64), tracks.track, tracks.keypoints, source_index, width
-    )
+    frames = tracks.frame.astype(np.int64)
+    source_index, width = _processed(labels, int(frames.max(initial=-1)) + 1, truth)
+    ids, causes = track_causes(truth, frames, tracks.track, tracks.keypoints, source_index, width)
     row = np.searchsorted(ids, points.track)
     if not np.isin(points.track, ids).all():
         raise InputError(f"{labels}: {POINTS_FILE} has tracks that {TRACKS_FILE} lacks; run it again")
@@ -96,7 +102,21 @@ def judge_labels(labels: Path, simulation: Path) -> Judged:
         "mean_error": points.mean_error[labelled].astype(np.float64),
         "max_error": points.max_error[labelled].astype(np.float64),
     }
-    return Judged(cause[labelled], scores, unstable, np.bincount(cause, minlength=len(PRECEDENCE)).astype(np.int64))
+    sequence = open_sequence(simulation, width=width)
+    depth = {row: sequence.depth(int(index)) for row, index in enumerate(source_index)}
+    true_error = np.full(int(labelled.sum()), np.nan)
+    if sequence.ground_truth is not None:
+        true_error = true_track_errors(
+            frames,
+            tracks.track,
+            tracks.keypoints,
+            points.track[labelled],
+            sequence.camera,
+            sequence.ground_truth.world_from_cam[source_index],
+            {row: image for row, image in depth.items() if image is not None},
+        )
+    total = np.bincount(cause, minlength=len(PRECEDENCE)).astype(np.int64)
+    return Judged(cause[labelled], scores, unstable, total, true_error)
 
 
 def judge_frontend(frontend: Any, simulation: Path, stride: int = 10, threshold: float = 0.5) -> Judged:
@@ -117,66 +137,80 @@ def judge_frontend(frontend: Any, simulation: Path, stride: int = 10, threshold:
         stability.append(features.stability.astype(np.float64))
     cause, stable = np.concatenate(causes), np.concatenate(stability)
     total = np.bincount(cause, minlength=len(PRECEDENCE)).astype(np.int64)
-    return Judged(cause, {"head": 1 - stable}, stable < threshold, total)
+    return Judged(cause, {"head": 1 - stable}, stable < threshold, total, np.full(len(cause), np.nan))
 
 
 def summarise(judged: Judged) -> dict[str, Any]:
     """What `stability.json` says about these points."""
     static = judged.cause == PRECEDENCE.index("static")
+    strayed = static & (judged.true_error >= STRAYED)
+    followed = static & (judged.true_error < STRAYED)
     groups = {"moving_or_highlight": HEADLINE, "all": PRECEDENCE[:-1], **{name: (name,) for name in PRECEDENCE[:-1]}}
     rows = []
     for group, names in groups.items():
         ranks = [PRECEDENCE.index(name) for name in names]
         positive = np.isin(judged.cause, ranks)
-        used = positive | static
-        measures = {
-            name: {
-                "roc_auc": roc_auc(score[used], positive[used]),
-                "average_precision": average_precision(score[used], positive[used]) if static.any() else None,
-            }
-            for name, score in judged.scores.items()
-        }
-        rows.append(
-            {
-                "cause": group,
-                "points": int(judged.total[ranks].sum()),
-                "labelled": int(positive.sum()),
-                "unstable": int((positive & judged.called_unstable).sum()),
-                "recall": float(judged.called_unstable[positive].mean()) if positive.any() else None,
-                "scores": measures,
-            }
-        )
-    calm = int((static & judged.called_unstable).sum())
+        rows.append(_row(group, int(judged.total[ranks].sum()), positive, static, followed, judged))
+    if np.isfinite(judged.true_error).any():
+        rows.append(_row("wrong_links", int(strayed.sum()), strayed, followed, followed, judged))
     return {
         "causes": rows,
         "static": {
             "points": int(judged.total[PRECEDENCE.index("static")]),
             "labelled": int(static.sum()),
-            "unstable": calm,
-            "false_alarms": calm / int(static.sum()) if static.any() else None,
+            **_share("false_alarms", static, judged),
+            "followed": {"labelled": int(followed.sum()), **_share("false_alarms", followed, judged)},
         },
     }
 
 
+def _row(
+    name: str,
+    points: int,
+    positive: NDArray[np.bool_],
+    static: NDArray[np.bool_],
+    followed: NDArray[np.bool_],
+    judged: Judged,
+) -> dict[str, Any]:
+    """Counts, recall and measures of one group of positives."""
+    measures = {}
+    for score_name, score in judged.scores.items():
+        measures[score_name] = {
+            "roc_auc": roc_auc(score[positive | static], positive[positive | static]),
+            "roc_auc_followed": roc_auc(score[positive | followed], positive[positive | followed]),
+            "average_precision": average_precision(score[positive | static], positive[positive | static]),
+        }
+    counts = {"cause": name, "points": points, "labelled": int(positive.sum())}
+    return {**counts, **_share("recall", positive, judged), "scores": measures}
+
+
+def _share(name: str, chosen: NDArray[np.bool_], judged: Judged) -> dict[str, Any]:
+    unstable = judged.called_unstable[chosen]
+    return {"unstable": int(unstable.sum()), name: float(unstable.mean()) if len(unstable) else None}
+
+
 def stability_table(results: dict[str, Any]) -> str:
-    """The summary as a Markdown table."""
+    """The summary as Markdown: AUC against all static points / against those that were truly followed."""
     lines = []
     for subject in results["subjects"]:
         names = list(subject["causes"][0]["scores"])
+        known = subject["static"]["followed"]["labelled"] > 0
         head = " | ".join(f"AUC {name}" for name in names)
         lines += [f"{subject['name']}", "", f"| true cause | points | labelled | recall | {head} | AP {names[-1]} |"]
         lines.append("|---|" + "---:|" * (4 + len(names)))
         for row in subject["causes"]:
-            aucs = " | ".join(_number(row["scores"][name]["roc_auc"]) for name in names)
-            precision = _number(row["scores"][names[-1]]["average_precision"])
-            cells = (row["cause"].replace("_", " "), row["points"], row["labelled"], _number(row["recall"]))
-            lines.append(f"| {' | '.join(map(str, cells))} | {aucs} | {precision} |")
+            cells = [row["cause"].replace("_", " "), str(row["points"]), str(row["labelled"]), _number(row["recall"])]
+            for name in names:
+                score = row["scores"][name]
+                followed = f" / {_number(score['roc_auc_followed'])}" if known else ""
+                cells.append(_number(score["roc_auc"]) + followed)
+            cells.append(_number(row["scores"][names[-1]]["average_precision"]))
+            lines.append(f"| {' | '.join(cells)} |")
         calm = subject["static"]
-        lines += [
-            "",
-            f"Static points: {calm['points']}, labelled {calm['labelled']}, called unstable {calm['unstable']}.",
-            "",
-        ]
+        text = f"Static points: {calm['points']}, labelled {calm['labelled']}, called unstable {calm['unstable']}"
+        if known:
+            text += f"; truly followed {calm['followed']['labelled']}, called unstable {calm['followed']['unstable']}"
+        lines += ["", f"{text}.", ""]
     return "\n".join(lines)
 
 

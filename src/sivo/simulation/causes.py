@@ -16,7 +16,7 @@ class Cause(IntEnum):
 
     STATIC = 0  # nothing speaks against this pixel
     MOVING = 1  # an object that moves
-    HIGHLIGHT = 2  # specular light, which goes with the viewer
+    HIGHLIGHT = 2  # structure made by specular light, which goes with the viewer
     SHADOW_EDGE = 3  # the edge of a cast shadow that moves
     DEPTH_DISCONTINUITY = 4  # a jump of depth: the place of t-junctions
     REPEATED_TEXTURE = 5  # a point that looks like its neighbours
@@ -49,10 +49,18 @@ def cause_image(
     causes[known & renderer.repeated[geom]] = Cause.REPEATED_TEXTURE
     causes[_shadow_edges(matt, unshadowed, later)] = Cause.SHADOW_EDGE
     causes[_depth_discontinuities(depth)] = Cause.DEPTH_DISCONTINUITY
-    added = image.astype(np.int16) - matt
-    causes[added.max(axis=2) >= _HIGHLIGHT] = Cause.HIGHLIGHT
+    causes[_highlights(image, matt)] = Cause.HIGHLIGHT
     causes[moving] = Cause.MOVING
     return causes
+
+
+def _highlights(image: UInt8, matt: UInt8) -> np.ndarray:
+    """Where specular light is bright, and the picture's structure is more its than the surface's."""
+    added = np.clip(image.astype(np.int16) - matt, 0, 255).max(axis=2).astype(np.uint8)
+    kernel = np.ones((5, 5), np.uint8)
+    of_light = cv2.morphologyEx(added, cv2.MORPH_GRADIENT, kernel)
+    of_surface = cv2.morphologyEx(cv2.cvtColor(matt, cv2.COLOR_RGB2GRAY), cv2.MORPH_GRADIENT, kernel)
+    return np.asarray((added >= _HIGHLIGHT) & (of_light >= of_surface))
 
 
 def _shadow_edges(matt: UInt8, unshadowed: UInt8, later: UInt8) -> np.ndarray:
