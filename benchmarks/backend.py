@@ -159,11 +159,8 @@ def _print_window(row: dict[str, object]) -> None:
     print(f"  ms per iteration, 1 thread       Ceres {row['ceres_version']}      sivo    ratio")
     for kind, label in (("exact", "exact objective"), ("plain", "without depth regulariser")):
         print(f"    {label:28s} {ceres[kind]:10.2f} {sivo[kind]:9.2f} {ceres[kind] / sivo[kind]:8.1f}")
-    print("    sivo:  " + ", ".join(f"{part} {ms:.3f}" for part, ms in row["sivo_parts_ms"].items()))
-    print(
-        "    Ceres, by its own wall clock: "
-        + ", ".join(f"{part} {ms:.2f}" for part, ms in row["ceres_parts_ms"].items())
-    )
+    for label, parts in (("sivo", row["sivo_parts_ms"]), ("Ceres, its own wall clock", row["ceres_parts_ms"])):
+        print(f"    {label}: " + ", ".join(f"{part} {ms:.3f}" for part, ms in parts.items()))
 
 
 def _compare_frames(program: Path, recording: Recording, frames: int) -> dict[str, object]:
