@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes.util
+import math
 import os
 import sys
 from types import ModuleType, TracebackType
@@ -29,7 +30,7 @@ _OPTIONS = """
 
 def camera_of(width: int, height: int, fov: float) -> Camera:
     """The pinhole camera of a symmetric frustum: the principal point is the middle of the image."""
-    focal = width / 2 / np.tan(np.radians(fov) / 2)
+    focal = width / 2 / math.tan(math.radians(fov) / 2)
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
