@@ -1,7 +1,8 @@
 """Mode `paper`: the paper's own scheme and nothing else ("Camera Pose and Point Depth Initialization").
 
 Connect-the-dots tracks are the points; a new pose is the previous pose, a new depth is 1, and bundle adjustment with
-the depth regulariser over the last 30 consecutive poses does the rest.
+the depth regulariser over the last 30 consecutive poses does the rest. It is only watched: where two-view geometry
+contradicts it, the journal says so.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import numpy as np
 
 from sivo.geometry import se3
 from sivo.geometry.camera import Camera
+from sivo.odometry.health import HealthCheck
 from sivo.odometry.journal import Journal
 from sivo.odometry.local_map import LocalMap
 from sivo.odometry.settings import OdometrySettings
@@ -30,6 +32,7 @@ class PaperMapper:
         self._journal = journal
         self._map: LocalMap | None = None
         self._window: list[View] = []
+        self._health = HealthCheck(camera, settings.health, descriptor_distance, settings.seed)
 
     @property
     def local_map(self) -> LocalMap | None:
@@ -57,6 +60,8 @@ class PaperMapper:
             max_error=None,
         )
         self._journal.tracked(view, len(view.observed), 1.0, report)
+        if self._health.contradicts(view, {earlier.position: earlier for earlier in self._window}):
+            self._journal.contradicted(view, "the mode `paper` goes on all the same")
         if len(self._window) > self._settings.window.paper_poses:
             self._journal.finalise(self._window.pop(0), self._map)
 
