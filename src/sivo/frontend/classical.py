@@ -13,9 +13,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sivo.errors import ConfigError, MissingExtraError
+from sivo.errors import ConfigError
 from sivo.types import Features, Float32, UInt8
 
+_opencv: Any = cv2  # its type stubs lack the detectors' constructors
 _ORB_CANDIDATES = 4  # times max_keypoints; ORB's own choice of the strongest clusters on few structures
 
 
@@ -91,10 +92,8 @@ class SurfFrontend:
         return Features(keypoints, unit_rows(descriptors), scores).take(best_first)
 
     def _with_mahotas(self, grey: UInt8) -> tuple[Float32, Float32, Float32]:
-        try:
-            from mahotas.features import surf
-        except ImportError:
-            raise MissingExtraError("SURF", "surf") from None
+        from mahotas.features import surf
+
         rows = surf.surf(grey, threshold=self._threshold, max_points=self._max_keypoints)
         # rows are y, x, scale, score, laplacian, angle, 64 descriptor values
         return rows[:, 1::-1].astype(np.float32), rows[:, 3].astype(np.float32), rows[:, 6:].astype(np.float32)
@@ -136,22 +135,22 @@ def spread_over_image(pixels: Float32, shape: tuple[int, ...], count: int) -> li
 
 
 def _sift(count: int, sensitive: bool) -> Any:
-    return cv2.SIFT_create(nfeatures=count, contrastThreshold=0.01 if sensitive else 0.04)
+    return _opencv.SIFT_create(nfeatures=count, contrastThreshold=0.01 if sensitive else 0.04)
 
 
 def _orb(count: int, sensitive: bool) -> Any:
-    return cv2.ORB_create(nfeatures=count, fastThreshold=5 if sensitive else 20)
+    return _opencv.ORB_create(nfeatures=count, fastThreshold=5 if sensitive else 20)
 
 
 def _akaze(count: int, sensitive: bool) -> Any:
     # OpenCV 5 moved AKAZE to the contrib module
-    create = getattr(cv2, "AKAZE_create", None) or cv2.xfeatures2d.AKAZE_create
+    create = getattr(_opencv, "AKAZE_create", None) or _opencv.xfeatures2d.AKAZE_create
     return create(threshold=1e-4 if sensitive else 1e-3)
 
 
 def _opencv_surf(hessian_threshold: float) -> Any | None:
     try:
-        return cv2.xfeatures2d.SURF_create(hessian_threshold)
+        return _opencv.xfeatures2d.SURF_create(hessian_threshold)
     except (AttributeError, cv2.error):
         return None
 
