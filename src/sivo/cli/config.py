@@ -8,6 +8,7 @@ import importlib
 from sivo.cli.options import add_config_arguments
 
 SETTINGS = {  # command -> its settings
+    "simulate": "sivo.simulation.settings:SimulationSettings",
     "label": "sivo.odometry.run_settings:RunSettings",
     "run": "sivo.odometry.run_settings:RunSettings",
     "evaluate-pose": "sivo.evaluation.settings:PoseCommandSettings",
