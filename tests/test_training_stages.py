@@ -66,6 +66,16 @@ def test_same_seed_same_curve_and_it_falls(tmp_path: Path) -> None:
     assert np.mean(curve[-3:]) < 0.9 * curve[0]
 
 
+def test_more_steps_than_first_planned_go_on_where_it_ended(tmp_path: Path) -> None:
+    joint(tmp_path / "long", steps=8).run(progress=False)
+    longer = joint(tmp_path / "long", steps=10)
+    assert longer.resume()
+    longer.run(progress=False)
+    curve = losses_of(tmp_path / "long")
+    assert len(curve) == 3  # after steps 5, 8 and 10
+    assert max(curve) < 1.5 * min(curve)  # each is a mean over its own steps
+
+
 @pytest.mark.parametrize("killed_at", [7, 33])
 def test_a_killed_training_ends_as_one_that_was_not(tmp_path: Path, killed_at: int) -> None:
     whole = state(joint(tmp_path / "whole").run(progress=False))

@@ -147,7 +147,7 @@ class Trainer:
         self.stage.train()
         sums: dict[str, Tensor] = {}
         window_start = saved = time.monotonic()
-        waiting = 0.0
+        count, waiting = 0, 0.0
         loader = iter(self._loader())
         for _ in tqdm(range(self.step, settings.steps), "training", initial=self.step, total=settings.steps,
                       unit="step", disable=not (progress and self.share.leads)):  # fmt: skip
@@ -157,15 +157,15 @@ class Trainer:
             for name, value in self._step(batch).items():
                 sums[name] = sums[name] + value if name in sums else value
             self.step += 1
+            count += 1
             if self.step % settings.log_every and self.step < settings.steps:
                 continue
-            count = (self.step - 1) % settings.log_every + 1
             now = time.monotonic()
             row = {name: float(value) / count for name, value in sums.items()}
             self._stop_if_diverged(row["loss"])
             self.seconds += now - window_start
             self._log(row, (now - window_start) / count, waiting / (now - window_start))
-            sums, waiting, window_start = {}, 0.0, now
+            sums, count, waiting, window_start = {}, 0, 0.0, now
             if self.share.leads and (now - saved > 60 * settings.checkpoint_minutes or self.step == settings.steps):
                 self.save()
                 saved = now
