@@ -74,13 +74,9 @@ class HealthCheck:
         self._rounds.append(counts)
         if len(self._rounds) < settings.rounds:
             return False
-        map_inliers, own_inliers = np.sum(self._rounds, axis=0).T  # (gaps,) each
-        together = own_inliers.sum() >= settings.min_evidence and (
-            map_inliers.sum() < settings.min_agreement * own_inliers.sum()
-        )
-        # drift of the map shows between the views farthest apart, which the many matches of near ones would drown
-        one_gap = (own_inliers >= settings.min_evidence) & (map_inliers < settings.min_agreement_of_gap * own_inliers)
-        return bool(together or one_gap.any())
+        map_inliers, own_inliers = np.sum(self._rounds, axis=(0, 1))
+        enough = own_inliers >= settings.min_evidence
+        return bool(enough and map_inliers < settings.min_agreement * own_inliers)
 
 
 def agreement(

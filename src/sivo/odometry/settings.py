@@ -66,12 +66,11 @@ class HealthSettings:
     interval: int = 5  # frames between two checks
     gaps: tuple[int, ...] = (3, 6, 12)  # frames between the two views of a check
     epipolar_error: float = 1.5  # pixels
-    min_inliers: int = 20  # of the two views' own essential matrix; fewer say nothing
+    min_inliers: int = 30  # of the two views' own essential matrix; fewer say nothing
     min_inlier_share: float = 0.15  # of their matches
     rounds: int = 3  # consecutive checks that are judged together
     min_evidence: int = 100  # inliers in all of them; fewer decide nothing
-    min_agreement: float = 0.85  # over all gaps: right maps stay over 0.90, wrong ones fall under 0.80
-    min_agreement_of_gap: float = 0.7  # of one gap alone: right maps stay over 0.80, drifting ones fall under 0.60
+    min_agreement: float = 0.85  # right maps stay over 0.90, wrong ones fall under 0.80
     young_frames: int = 60  # a map contradicted this early is started anew over the same frames
 
 
