@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import signal
@@ -122,7 +123,11 @@ def test_an_interrupt_leaves_a_valid_partial_result(walk: Path, tmp_path: Path) 
     (long / "camera.yaml").write_bytes((walk / "camera.yaml").read_bytes())
     out = tmp_path / "out"
     command = [sys.executable, "-m", "sivo", "run", str(long), "-o", str(out), "--frontend", "orb"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
+    # a shell's background job hands SIGINT down as ignored, and Python then leaves it so
+    heed_interrupts = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, preexec_fn=heed_interrupts
+    ) as process:
         assert process.stderr is not None
         seen = b""
         deadline = time.monotonic() + 240
