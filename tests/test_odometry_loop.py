@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 from simulated_features import CAMERA, hand_motion, nothing_to_see, observe, room
@@ -9,6 +12,7 @@ from simulated_features import CAMERA, hand_motion, nothing_to_see, observe, roo
 from sivo.geometry.alignment import align_points
 from sivo.odometry.journal import FinalView
 from sivo.odometry.settings import OdometrySettings
+from sivo.odometry.view import View
 from sivo.odometry.visual_odometry import VisualOdometry
 from sivo.types import Features, Float64
 
@@ -172,16 +176,14 @@ def test_frames_without_any_keypoint_are_lost_not_fatal(walk: tuple[Float64, lis
 
 
 def test_memory_holds_no_more_views_than_the_window(walk: tuple[Float64, list[Features]]) -> None:
-    import gc
-
-    from sivo.odometry.view import View
-
     features = walk[1] + views(hand_motion(240)[90:])
     odometry = VisualOdometry(_NoFrontend(), CAMERA)
+    seen: list[weakref.ref[View]] = []
     alive = []
     for i, each in enumerate(features):
-        odometry.track_features(each, i / 30.0)
+        seen.append(weakref.ref(odometry.track_features(each, i / 30.0)))
         if i in (150, 239):
             gc.collect()
-            alive.append(sum(isinstance(thing, View) for thing in gc.get_objects()))
-    assert alive[1] <= max(alive[0], 200) * 1.2
+            alive.append(sum(view() is not None for view in seen))
+    assert alive[1] <= alive[0] + 20
+    assert alive[1] < 150
