@@ -13,6 +13,8 @@ from sivo.backend.solver import solve
 from sivo.odometry.view import NO_POINT, Mask, PointStore, View
 from sivo.types import Float64, Int64
 
+_WORTH_SOLVING_AGAIN = 0.01  # share of observations dropped; fewer hardly move the optimum, the next frame solves it
+
 
 @dataclass(frozen=True)
 class WindowReport:
@@ -50,8 +52,8 @@ def adjust(
 ) -> WindowReport:
     """Adjust the poses of `free` and all points that they observe; poses of `constant` stay.
 
-    Observations that end over `max_error` pixels or behind the camera are dropped, and the window is solved again;
-    None drops nothing (mode `paper`).
+    Observations that end over `max_error` pixels or behind the camera are dropped, and the window is solved again if
+    they were many; None drops nothing (mode `paper`).
     """
     views = [*free, *constant]
     fixed = np.arange(len(views)) >= len(free)
@@ -59,26 +61,26 @@ def adjust(
     if len(observations.camera) == 0:
         return WindowReport(float("nan"), 0, 0, 0)
     result = _solve(views, fixed, observations, store, K, objective, solver)
+    if max_error is None:
+        return WindowReport(float(result.errors.mean()), len(result.errors), 0, result.iterations)
     iterations = result.iterations
-    dropped = 0
-    if max_error is not None:
-        bad = (result.errors > max_error) | (result.depths <= 0.0)
-        dropped = int(bad.sum())
-        if dropped:
-            _drop(views, observations, bad)
-            observations = _gather(views, len(free), store)
-            result = _solve(views, fixed, observations, store, K, objective, solver)
-            iterations += result.iterations
-            bad = (result.errors > max_error) | (result.depths <= 0.0)
-            dropped += int(bad.sum())
-            _drop(views, observations, bad)
-            result_errors = result.errors[~bad]
-        else:
-            result_errors = result.errors
-    else:
-        result_errors = result.errors
-    mean_error = float(result_errors.mean()) if len(result_errors) else float("nan")
-    return WindowReport(mean_error, len(result_errors), dropped, iterations)
+    bad = _misfits(result, max_error)
+    dropped = int(bad.sum())
+    _drop(views, observations, bad)
+    if dropped > _WORTH_SOLVING_AGAIN * len(bad):
+        observations = _gather(views, len(free), store)
+        result = _solve(views, fixed, observations, store, K, objective, solver)
+        iterations += result.iterations
+        bad = _misfits(result, max_error)
+        dropped += int(bad.sum())
+        _drop(views, observations, bad)
+    kept = result.errors[~bad]
+    return WindowReport(float(kept.mean()) if len(kept) else float("nan"), len(kept), dropped, iterations)
+
+
+def _misfits(result: BundleResult, max_error: float) -> Mask:
+    """Observations (O,) that the solution does not explain."""
+    return (result.errors > max_error) | (result.depths <= 0.0)
 
 
 def _gather(views: Sequence[View], free_count: int, store: PointStore) -> _Observations:
