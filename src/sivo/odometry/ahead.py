@@ -1,4 +1,4 @@
-"""Reading and detecting one step ahead of the backend, in a second thread, so that two cores are used."""
+"""Reading, detecting and matching ahead of the backend, in a second thread, so that two cores are used."""
 
 from __future__ import annotations
 
@@ -7,23 +7,27 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
-from sivo.types import Features, Frame
+from sivo.odometry.visual_odometry import MatchedFeatures
+from sivo.types import Features, Frame, UInt8
 
 _AHEAD = 2  # frames; more would only cost memory
 
 
 @dataclass(frozen=True)
 class DetectedFrame:
-    """A frame with its features, and the seconds that they took."""
+    """A frame with its matched features, and the seconds that they took."""
 
     frame: Frame
-    features: Features
+    matched: MatchedFeatures
     reading: float  # seconds
     detecting: float  # seconds
+    matching: float  # seconds
 
 
-def detected_ahead(frames: Iterable[Frame], detect: Callable[..., Features]) -> Iterator[DetectedFrame]:
-    """The frames in order with their features, computed ahead by one worker thread.
+def detected_ahead(
+    frames: Iterable[Frame], detect: Callable[[UInt8], Features], match: Callable[[Features], MatchedFeatures]
+) -> Iterator[DetectedFrame]:
+    """The frames in order with their features and matches, computed ahead by one worker thread.
 
     An error of a frame is raised when its turn comes, so that everything before it is processed.
     """
@@ -36,7 +40,9 @@ def detected_ahead(frames: Iterable[Frame], detect: Callable[..., Features]) -> 
             return None
         read = time.perf_counter()
         features = detect(frame.image)
-        return DetectedFrame(frame, features, read - start, time.perf_counter() - read)
+        detected = time.perf_counter()
+        matched = match(features)
+        return DetectedFrame(frame, matched, read - start, detected - read, time.perf_counter() - detected)
 
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="detect") as worker:
         waiting: list[Future[DetectedFrame | None]] = [worker.submit(next_frame) for _ in range(_AHEAD)]

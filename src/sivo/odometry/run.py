@@ -108,12 +108,13 @@ def _track_all(
     """All frames in order; returns the recording's index of each processed one, and whether it was interrupted."""
     processed: list[int] = []
     try:
-        for detected in detected_ahead(sequence, frontend):
+        for detected in detected_ahead(sequence, frontend, odometry.match):
             start = time.perf_counter()
-            view = odometry.track_features(detected.features, detected.frame.time)
+            view = odometry.track_matched(detected.matched, detected.frame.time)
             seconds["track and adjust"] += time.perf_counter() - start
             seconds["read"] += detected.reading
             seconds["detect"] += detected.detecting
+            seconds["match"] += detected.matching
             processed.append(detected.frame.index)
             viewer.show(detected.frame, view, odometry.running_points)
             if progress is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +16,16 @@ from sivo.odometry.settings import OdometrySettings
 from sivo.odometry.view import View
 from sivo.tracking.connect import TrackChain
 from sivo.tracking.matching import distance_threshold, match_units, unit_descriptors
-from sivo.types import Features, Float64, Frame, SparseMap, Trajectory
+from sivo.types import Features, Float32, Float64, Frame, Int64, SparseMap, Trajectory
+
+
+@dataclass(frozen=True)
+class MatchedFeatures:
+    """Features of a frame, matched with the frame before."""
+
+    features: Features
+    descriptors: Float32  # (N, D) unit vectors
+    matches: Int64 | None  # (K, 2) rows of the frame before and of this one; None for the first frame
 
 
 class VisualOdometry:
@@ -44,6 +54,7 @@ class VisualOdometry:
         self._journal = Journal(camera, on_final)
         self._chain = TrackChain()
         self._previous: View | None = None
+        self._matched_before: Float32 | None = None  # unit descriptors of the last frame given to `match`
         self._mapper: RobustMapper | PaperMapper | None = None
         self._count = 0
 
@@ -53,7 +64,21 @@ class VisualOdometry:
 
     def track_features(self, features: Features, time: float) -> View:
         """As `track`, with the features of the frame at hand."""
-        view = self._extend_tracks(features, time)
+        return self.track_matched(self.match(features), time)
+
+    def match(self, features: Features) -> MatchedFeatures:
+        """Match the next frame with the one before; frames in order, each once, and it may run ahead in a thread."""
+        descriptors = unit_descriptors(features)
+        matches = None
+        if self._matched_before is not None:
+            matches = match_units(self._matched_before, descriptors, self._max_distance(features))
+        self._matched_before = descriptors
+        return MatchedFeatures(features, descriptors, matches)
+
+    def track_matched(self, matched: MatchedFeatures, time: float) -> View:
+        """As `track`, with the features of the frame at hand and matched."""
+        features = matched.features
+        view = self._extend_tracks(matched, time)
         if self._mapper is None:
             mapper = RobustMapper if self._settings.initialisation == "robust" else PaperMapper
             self._mapper = mapper(self._camera, self._settings, self._max_distance(features), self._journal)
@@ -93,20 +118,19 @@ class VisualOdometry:
         """What went wrong where."""
         return self._journal.events
 
-    def _extend_tracks(self, features: Features, time: float) -> View:
+    def _extend_tracks(self, matched: MatchedFeatures, time: float) -> View:
         """Connect the dots with the previous frame."""
-        descriptors = unit_descriptors(features)
-        if self._previous is None:
+        features = matched.features
+        if self._previous is None or matched.matches is None:
             tracks = self._chain.start(len(features))
         else:
-            matches = match_units(self._previous.descriptors, descriptors, self._max_distance(features))
-            tracks = self._chain.extend(self._previous.tracks, matches, len(features))
+            tracks = self._chain.extend(self._previous.tracks, matched.matches, len(features))
         weights = features.weights() if self._use_stability else np.ones(len(features))
         return View(
             position=self._count,
             time=time,
             keypoints=features.keypoints.astype(np.float64),
-            descriptors=descriptors,
+            descriptors=matched.descriptors,
             weights=weights.astype(np.float64),
             tracks=tracks,
             points=np.full(len(features), -1, np.int64),
