@@ -6,10 +6,14 @@ import argparse
 import sys
 from pathlib import Path
 
-from sivo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from sivo.cli.options import (
+    FRONTEND_FLAGS,
+    add_config_arguments,
+    add_frontend_arguments,
+    add_sequence_arguments,
+    settings_from,
+)
 from sivo.odometry.run_settings import RunSettings
-
-_FLAGS = {"frontend": "frontend.name", "max_keypoints": "frontend.max_keypoints", "seed": "odometry.seed"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,34 +28,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--relabel", action="store_true", help="where LABELS was made with other settings, label all of it anew"
     )
-    parser.add_argument(
-        "--frontend",
-        default=argparse.SUPPRESS,
-        metavar="NAME",
-        help=f"as of `sivo run` ({defaults.frontend.name})",
-    )
-    parser.add_argument(
-        "--max-keypoints",
-        type=int,
-        default=argparse.SUPPRESS,
-        metavar="N",
-        help=f"per frame (default: {defaults.frontend.max_keypoints})",
-    )
-    parser.add_argument("--seed", type=int, default=argparse.SUPPRESS, help="of all random choices (default: 0)")
+    add_frontend_arguments(parser, defaults.frontend.name, defaults.frontend.max_keypoints)
     add_sequence_arguments(parser)
     add_config_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Label what is not labelled yet; 0 unless nothing could be."""
-    settings = settings_from(RunSettings, arguments, _FLAGS)
+    settings = settings_from(RunSettings, arguments, FRONTEND_FLAGS)
     from tqdm import tqdm
 
-    from sivo.backend.compile import compile_kernels
     from sivo.improvement.labelling import label_sequences
     from sivo.labeling.store import DONE, SequenceRecord
+    from sivo.odometry.compile import compile_odometry
 
-    compile_kernels(lambda words: print(words, file=sys.stderr))
+    compile_odometry(lambda words: print(words, file=sys.stderr))
     total = len(arguments.sequences)
     finished = 0
     with tqdm(unit="frame", desc=f"label 0/{total}", smoothing=0.1, delay=0.5) as bar:

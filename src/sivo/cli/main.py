@@ -31,6 +31,15 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 
 
+class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
+    """Shows a default where there is one to show and the text does not have it already."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        if action.default in (None, False, []) or "(default" in (action.help or ""):
+            return action.help
+        return super()._get_help_string(action)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point. Returns the exit status: 0 done, 2 an error that the user can mend, 130 interrupted."""
     words = list(sys.argv[1:] if argv is None else argv)
@@ -59,9 +68,7 @@ def _parser(verb: str | None) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"sivo {__version__}")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
     for name, (module_name, help_line) in COMMANDS.items():
-        verb_parser = verbs.add_parser(
-            name, help=help_line, description=help_line, formatter_class=argparse.ArgumentDefaultsHelpFormatter
-        )
+        verb_parser = verbs.add_parser(name, help=help_line, description=help_line, formatter_class=HelpFormatter)
         if name == verb:
             module: ModuleType = importlib.import_module(f"sivo.cli.{module_name}")
             module.add_arguments(verb_parser)

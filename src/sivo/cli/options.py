@@ -26,12 +26,32 @@ _SEQUENCE_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("topic", {"metavar": "NAME", "help": "image topic of a ROS bag, or camera of a recording with several"}),
 )
 
+FRONTEND_FLAGS = {"frontend": "frontend.name", "max_keypoints": "frontend.max_keypoints", "seed": "odometry.seed"}
+
 
 def add_sequence_arguments(parser: argparse.ArgumentParser) -> None:
     """How the sequence is read; read back by `settings_from`."""
     group = parser.add_argument_group("how the sequence is read")
     for name, options in _SEQUENCE_OPTIONS:
         group.add_argument(f"--{name}", default=argparse.SUPPRESS, **options)
+
+
+def add_frontend_arguments(parser: argparse.ArgumentParser, name: str, max_keypoints: int) -> None:
+    """Which frontend, how many keypoints, and the seed; the defaults are only shown. Read back with FRONTEND_FLAGS."""
+    parser.add_argument(
+        "--frontend",
+        default=argparse.SUPPRESS,
+        metavar="NAME",
+        help=f"sift, orb, akaze, surf, a bundled network or a .safetensors file (default: {name})",
+    )
+    parser.add_argument(
+        "--max-keypoints",
+        type=int,
+        default=argparse.SUPPRESS,
+        metavar="N",
+        help=f"per frame (default: {max_keypoints})",
+    )
+    parser.add_argument("--seed", type=int, default=argparse.SUPPRESS, help="of all random choices (default: 0)")
 
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:

@@ -7,20 +7,22 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sivo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from sivo.cli.options import (
+    FRONTEND_FLAGS,
+    add_config_arguments,
+    add_frontend_arguments,
+    add_sequence_arguments,
+    settings_from,
+)
 from sivo.odometry.run_settings import RunSettings
 
 if TYPE_CHECKING:
     from sivo.odometry.run import RunSummary
+    from sivo.odometry.view import View
     from sivo.odometry.viewer import Viewer
     from sivo.sequences import Sequence
 
-_FLAGS = {
-    "frontend": "frontend.name",
-    "max_keypoints": "frontend.max_keypoints",
-    "initialisation": "odometry.initialisation",
-    "seed": "odometry.seed",
-}
+_FLAGS = {**FRONTEND_FLAGS, "initialisation": "odometry.initialisation"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,19 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     defaults = RunSettings()
     parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a video, an image folder or a data set")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
-    parser.add_argument(
-        "--frontend",
-        default=argparse.SUPPRESS,
-        metavar="NAME",
-        help=f"sift, orb, akaze, surf, a bundled network or a .safetensors file (default: {defaults.frontend.name})",
-    )
-    parser.add_argument(
-        "--max-keypoints",
-        type=int,
-        default=argparse.SUPPRESS,
-        metavar="N",
-        help=f"per frame (default: {defaults.frontend.max_keypoints})",
-    )
+    add_frontend_arguments(parser, defaults.frontend.name, defaults.frontend.max_keypoints)
     parser.add_argument(
         "--initialisation",
         choices=("robust", "paper"),
@@ -53,7 +43,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", action="store_true", help="watch the run in Rerun (pip install 'sivo[view]')")
     parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="record it for Rerun; works without a screen")
     parser.add_argument("--report", action="store_true", help="write OUT/report.html at the end, as `sivo report` does")
-    parser.add_argument("--seed", type=int, default=argparse.SUPPRESS, help="of all random choices (default: 0)")
     add_sequence_arguments(parser)
     add_config_arguments(parser)
 
@@ -97,19 +86,15 @@ def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: View
     """The run with its progress line."""
     from tqdm import tqdm
 
-    from sivo.backend.compile import compile_kernels
+    from sivo.odometry.compile import compile_odometry
     from sivo.odometry.run import run_odometry
 
-    compile_kernels(lambda words: print(words, file=sys.stderr))
-    lost = 0
+    compile_odometry(lambda words: print(words, file=sys.stderr))
     with tqdm(total=sequence.length, unit="frame", desc="run", smoothing=0.1, delay=0.5) as bar:
 
-        def progress(view: object) -> None:
-            nonlocal lost
-            lost += getattr(view, "cam_from_world", None) is None
+        def progress(view: View) -> None:
+            bar.set_postfix_str("no pose yet" if view.cam_from_world is None else "", refresh=False)
             bar.update()
-            if lost:
-                bar.set_postfix(without_pose=lost, refresh=False)
 
         return run_odometry(sequence, folder, settings, viewer=viewer, progress=progress)
 
