@@ -7,14 +7,14 @@ needs points on weakly textured walls and doors too, so `sensitive=True` lowers 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 
 from sivo.errors import ConfigError
-from sivo.types import Features, Float32, UInt8
+from sivo.types import Features, Float32, Int64, UInt8
 
 _opencv: Any = cv2  # its type stubs lack the detectors' constructors
 _ORB_CANDIDATES = 4  # times max_keypoints; ORB's own choice of the strongest clusters on few structures
@@ -47,12 +47,10 @@ class ClassicalFrontend:
         grey = to_grey(image)
         cv2.setRNGSeed(0)  # some detectors sample; the same image must give the same features
         found = self._detector.detect(grey, None)
-        found = sorted(found, key=lambda keypoint: (-keypoint.response, keypoint.pt, keypoint.angle))
+        order, pixels = _best_first(found)
         if self._spread:
-            pixels = np.array([keypoint.pt for keypoint in found], np.float32).reshape(-1, 2)
-            found = [found[i] for i in spread_over_image(pixels, grey.shape, self._max_keypoints)]
-        else:
-            found = found[: self._max_keypoints]
+            order = order[spread_over_image(pixels[order], grey.shape, self._max_keypoints)]
+        found = [found[i] for i in order[: self._max_keypoints].tolist()]
         found, descriptors = self._detector.compute(grey, found)
         if not found:
             return self._nothing()
@@ -118,7 +116,15 @@ def unit_rows(descriptors: Float32) -> Float32:
     return (descriptors / np.maximum(norms, 1e-12)).astype(np.float32)
 
 
-def spread_over_image(pixels: Float32, shape: tuple[int, ...], count: int) -> list[int]:
+def _best_first(found: Sequence[Any]) -> tuple[Int64, Float32]:
+    """Order of OpenCV's keypoints by response, ties by place and angle; and their pixels (N, 2)."""
+    pixels = np.asarray(cv2.KeyPoint.convert(found), np.float32).reshape(-1, 2)
+    angles = np.array([keypoint.angle for keypoint in found])
+    responses = np.array([keypoint.response for keypoint in found])
+    return np.lexsort((angles, pixels[:, 1], pixels[:, 0], -responses)), pixels
+
+
+def spread_over_image(pixels: Float32, shape: tuple[int, ...], count: int) -> Int64:
     """Indices of up to `count` pixels (N, 2), sorted best first, taken in turn from the cells of a grid.
 
     Each cell gives its best point, then its second best and so on, so that a weakly textured part of the image keeps
@@ -131,7 +137,7 @@ def spread_over_image(pixels: Float32, shape: tuple[int, ...], count: int) -> li
     starts = np.searchsorted(cells[order], cells[order])
     rank = np.empty(len(pixels), np.int64)
     rank[order] = np.arange(len(pixels)) - starts  # 0 for the best of its cell
-    return [int(i) for i in np.argsort(rank, kind="stable")[:count]]
+    return np.argsort(rank, kind="stable")[:count]
 
 
 def _sift(count: int, sensitive: bool) -> Any:
