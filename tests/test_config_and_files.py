@@ -1,0 +1,99 @@
+"""Settings refuse what they do not know; files are whole or absent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from sivo import config
+from sivo.errors import ConfigError, OutputError
+from sivo.files import MARKER, check_output_folder, make_output_folder, write_json, write_text, written_atomically
+
+
+@dataclass(frozen=True)
+class Inner:
+    width: float = 1.5
+    names: tuple[str, ...] = ("a",)
+
+
+@dataclass(frozen=True)
+class Outer:
+    count: int = 3
+    label: str | None = None
+    inner: Inner = field(default_factory=Inner)
+
+
+def test_defaults_then_file_then_overrides(tmp_path: Path) -> None:
+    path = tmp_path / "settings.yaml"
+    path.write_text("count: 5\ninner:\n  width: 2\n")
+    settings = config.load(Outer, path, ["inner.width=4", "inner.names=[x, y]", "label=home"])
+    assert settings == Outer(5, "home", Inner(4.0, ("x", "y")))
+
+
+def test_what_is_printed_is_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "settings.yaml"
+    settings = Outer(7, "there", Inner(0.25, ("p", "q")))
+    path.write_text(config.to_yaml(settings))
+    assert config.load(Outer, path) == settings
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("inner.widht=2", "inner.width"),
+        ("cuont=2", "count"),
+        ("count=many", "many"),
+        ("count=2.5", "2.5"),
+        ("count=true", "True"),
+        ("inner=3", "inner"),
+        ("count", "section.name=value"),
+        ("count.more=1", "count"),
+    ],
+)
+def test_mistakes_are_named(override: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        config.load(Outer, None, [override])
+
+
+def test_a_file_that_is_no_settings_file_is_named(tmp_path: Path) -> None:
+    for text in ("- a list\n", "key: [unclosed\n"):
+        (tmp_path / "bad.yaml").write_text(text)
+        with pytest.raises(ConfigError, match=r"bad\.yaml"):
+            config.load(Outer, tmp_path / "bad.yaml")
+    with pytest.raises(ConfigError, match=r"none\.yaml"):
+        config.load(Outer, tmp_path / "none.yaml")
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_temporary(tmp_path: Path) -> None:
+    path = tmp_path / "result.txt"
+    write_text(path, "old")
+
+    def fail_half_way() -> None:
+        with written_atomically(path) as temporary:
+            temporary.write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail_half_way()
+    assert path.read_text() == "old"
+    assert [each.name for each in tmp_path.iterdir()] == ["result.txt"]
+
+
+def test_json_never_holds_nan(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(tmp_path / "x.json", {"a": float("nan")})
+    assert not list(tmp_path.iterdir())
+
+
+def test_our_own_folder_may_be_written_again_and_no_other(tmp_path: Path) -> None:
+    ours = tmp_path / "ours"
+    make_output_folder(ours, "run")
+    make_output_folder(ours, "run")
+    assert (ours / MARKER).exists()
+    with pytest.raises(OutputError, match="sivo run"):
+        check_output_folder(ours, "label")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="is a file"):
+        check_output_folder(tmp_path / "file", "run")

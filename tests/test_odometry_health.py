@@ -1,0 +1,73 @@
+"""The two-view check: silent on a right map, loud on a wrong one that fits its own tracks."""
+
+from __future__ import annotations
+
+import numpy as np
+from simulated_features import CAMERA, hand_motion, observe, room
+
+from sivo.geometry import se3
+from sivo.odometry.health import HealthCheck, epipolar_errors
+from sivo.odometry.settings import HealthSettings
+from sivo.odometry.view import View
+from sivo.tracking.matching import unit_descriptors
+from sivo.types import Float64
+
+
+def alarms(estimate: Float64, truth: Float64) -> list[int]:
+    """Positions at which the check speaks, for views of `truth` that the map believes to be at `estimate`."""
+    world = room()
+    check = HealthCheck(CAMERA, HealthSettings(), descriptor_distance=0.7, seed=0)
+    earlier: dict[int, View] = {}
+    said = []
+    for position, (believed, true) in enumerate(zip(estimate, truth, strict=True)):
+        features = observe(world, true, seed=position)
+        nothing = np.full(len(features), -1, np.int64)
+        view = View(
+            position=position,
+            time=position / 30.0,
+            keypoints=features.keypoints.astype(np.float64),
+            descriptors=unit_descriptors(features),
+            weights=np.ones(len(features)),
+            tracks=nothing,
+            points=nothing.copy(),
+            cam_from_world=se3.inverse(believed),
+        )
+        if check.contradicts(view, earlier):
+            said.append(position)
+        earlier[position] = view
+    return said
+
+
+def test_a_right_map_is_never_contradicted() -> None:
+    truth = hand_motion(60)
+    assert alarms(truth, truth) == []
+
+
+def test_scale_and_world_frame_are_free() -> None:
+    truth = hand_motion(40)
+    moved = se3.rigid(se3.so3_exp(np.array([0.4, -0.3, 1.0])), np.array([5.0, 2.0, -1.0])) @ truth
+    moved[:, :3, 3] *= 3.0
+    moved[:, :3, 3] -= 2.0 * moved[0, :3, 3]
+    assert alarms(moved, truth) == []
+
+
+def test_a_wrong_direction_of_motion_is_contradicted() -> None:
+    truth = hand_motion(40, step=0.06)
+    wrong = truth.copy()
+    wrong[:, 1, 3] += 0.08 * np.arange(40)  # the map believes in a climb that was not there
+    assert alarms(wrong, truth), "a map that climbs while the camera walks was believed"
+
+
+def test_a_wrong_turn_is_contradicted() -> None:
+    truth = hand_motion(40)
+    extra = se3.rigid(se3.so3_exp(np.radians(1.5) * np.arange(40)[:, None] * [0.0, 0.0, 1.0]), np.zeros((40, 3)))
+    assert alarms(truth @ extra, truth)
+
+
+def test_epipolar_errors_are_pixels_from_the_line() -> None:
+    b_from_a = se3.rigid(np.eye(3), np.array([1.0, 0.0, 0.0]))  # sideways: lines are rows
+    pixels_a = np.array([[100.0, 80.0], [200.0, 120.0]])
+    pixels_b = pixels_a + np.array([[30.0, 0.0], [10.0, 2.0]])
+    np.testing.assert_allclose(
+        epipolar_errors(b_from_a, CAMERA, pixels_a, pixels_b), [0.0, 2.0 / np.sqrt(2)], atol=1e-9
+    )
