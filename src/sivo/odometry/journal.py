@@ -97,24 +97,20 @@ class Journal:
         self._errors: list[float] = []
         self._positions: list[int] = []
         self._last_refusal = ""
-        self._open = False
         self.segments: list[Segment] = []
         self.events: list[Event] = []
-        self.health: list[tuple[int, int, float, float, float]] = []
 
     def started(self, views: Sequence[View]) -> None:
         """A segment begins with these views."""
-        self._open = True
         if self.segments:
             rotation, translation = self._last_pose[:3, :3], self._last_pose[:3, 3]
             self._placement = Similarity(self._last_depth, rotation, translation)
             self._note(views[0], "segment", f"segment {len(self.segments) + 1} starts: own scale, placed by guess")
         self._last_refusal = ""
 
-    def tracked(self, view: View, inliers: int, share: float, report: WindowReport) -> None:
-        """A view has a pose (not final yet)."""
+    def tracked(self, report: WindowReport) -> None:
+        """A view has a pose (not final yet), and this is how its window fits."""
         self._errors.append(report.mean_error)
-        self.health.append((view.position, inliers, share, report.mean_error, report.inlier_share))
 
     def refused(self, view: View, reason: str) -> None:
         """The map cannot start yet."""
@@ -133,7 +129,6 @@ class Journal:
     def restarted(self) -> None:
         """The segment that had begun is undone."""
         self._errors = []
-        self._open = False
 
     def give_up(self, views: Sequence[View]) -> None:
         """These views stay without a pose."""
@@ -186,7 +181,7 @@ class Journal:
                 reason=reason,
             )
         )
-        self._errors, self._positions, self._open = [], [], False
+        self._errors, self._positions = [], []
 
     @property
     def trajectory(self) -> Trajectory:

@@ -59,7 +59,7 @@ class PaperMapper:
             self._settings.paper_solver,
             max_error=None,
         )
-        self._journal.tracked(view, len(view.observed), 1.0, report)
+        self._journal.tracked(report)
         if self._health.contradicts(view, {earlier.position: earlier for earlier in self._window}):
             self._journal.contradicted(view, "the mode `paper` goes on all the same")
         if len(self._window) > self._settings.window.paper_poses:

@@ -56,7 +56,7 @@ class RobustMapper:
     def _advance(self, view: View) -> None:
         """One frame: localise, triangulate, adjust the window, slide it."""
         assert self._map is not None
-        inliers, share = self._map.localise(view, self._recent[-1])
+        inliers, _ = self._map.localise(view, self._recent[-1])
         if view.cam_from_world is None:
             self._lose(view, inliers)
             return
@@ -66,7 +66,7 @@ class RobustMapper:
         self._map.triangulate(view, [*self._free_keyframes(), *self._recent[:-1]])
         report = self._adjust_window()
         self._map.remember(view)
-        self._journal.tracked(view, inliers, share, report)
+        self._journal.tracked(report)
         if self._health.contradicts(view, {v.position: v for v in self._map.history}):
             self._answer_contradiction(view)
             return

@@ -198,8 +198,8 @@ def _grow(
                 break  # what lies before is another place, or too blurred
             missed = 0
         done.append(view)
-        others = [v for v in done[-16:-1] if v is not view]
-        local_map.triangulate(view, [*others, *([a] if view is not a and a not in others else [])])
+        others = done[-16:-1]
+        local_map.triangulate(view, others if view is a or a in others else [*others, a])
         free, constant = _start_window(done, a)
         adjust(free, constant, store, K, settings.objective, settings.solver, max_error)
         local_map.remember(view)
