@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sivo.tracking.connect import TrackChain
-from sivo.tracking.matching import distance_threshold, mutual_nearest_neighbours
+from sivo.tracking.matching import distance_threshold, mutual_nearest_neighbours, without_strays
 from sivo.types import Features
 
 
@@ -74,3 +74,16 @@ def test_a_track_that_missed_a_frame_does_not_come_back() -> None:
     first = chain.start(1)
     second = chain.extend(first, np.zeros((0, 2), np.int64), 0)
     assert chain.extend(second, np.zeros((0, 2), np.int64), 1).tolist() == [1]
+
+
+def test_links_far_from_what_all_others_do_are_dropped() -> None:
+    rng = np.random.default_rng(1)
+    a = rng.uniform(0, 320, (50, 2)).astype(np.float32)
+    b = a + np.float32([40, -3]) + rng.uniform(-5, 5, (50, 2)).astype(np.float32)  # the camera turns fast
+    b[[4, 17]] += np.float32([60, 0])
+    matches = np.stack([np.arange(50), rng.permutation(50)], axis=1)
+    shuffled = np.empty_like(b)
+    shuffled[matches[:, 1]] = b
+    kept = without_strays(matches, a, shuffled, limit=32.0)
+    assert sorted(set(range(50)) - set(kept[:, 0].tolist())) == [4, 17]
+    assert len(without_strays(matches[:0], a, shuffled, limit=32.0)) == 0

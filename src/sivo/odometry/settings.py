@@ -13,8 +13,13 @@ class MatchingSettings:
     """Matching of consecutive frames (paper, "Point Tracks")."""
 
     max_distance: float = 0.7  # tau on unit descriptors; binary ones use the equivalent share of bits
+    max_stray: float = 0.0  # of a link from the frame's median motion, share of the width; 0: any, as in the paper
     refind_radius: float = 8.0  # pixels at 640 wide: how far from its projection a lost map point is looked for
     refind_frames: int = 60  # map points not seen for longer than this are not looked for
+
+    def __post_init__(self) -> None:
+        if not self.max_stray >= 0:
+            raise ConfigError(f"max_stray={self.max_stray}: is a share of the image width, 0 for no limit")
 
 
 @dataclass(frozen=True)

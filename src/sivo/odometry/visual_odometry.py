@@ -15,7 +15,7 @@ from sivo.odometry.robust import RobustMapper
 from sivo.odometry.settings import OdometrySettings
 from sivo.odometry.view import View
 from sivo.tracking.connect import TrackChain
-from sivo.tracking.matching import distance_threshold, match_units, unit_descriptors
+from sivo.tracking.matching import distance_threshold, match_units, unit_descriptors, without_strays
 from sivo.types import Features, Float32, Float64, Frame, Int64, SparseMap, Trajectory
 
 
@@ -54,7 +54,7 @@ class VisualOdometry:
         self._journal = Journal(camera, on_final)
         self._chain = TrackChain()
         self._previous: View | None = None
-        self._matched_before: Float32 | None = None  # unit descriptors of the last frame given to `match`
+        self._matched_before: tuple[Float32, Float32] | None = None  # keypoints, unit descriptors of the last `match`
         self._mapper: RobustMapper | PaperMapper | None = None
         self._count = 0
 
@@ -71,8 +71,12 @@ class VisualOdometry:
         descriptors = unit_descriptors(features)
         matches = None
         if self._matched_before is not None:
-            matches = match_units(self._matched_before, descriptors, self._max_distance(features))
-        self._matched_before = descriptors
+            keypoints_before, descriptors_before = self._matched_before
+            matches = match_units(descriptors_before, descriptors, self._max_distance(features))
+            if self._settings.matching.max_stray > 0:
+                limit = self._settings.matching.max_stray * self._camera.width
+                matches = without_strays(matches, keypoints_before, features.keypoints, limit)
+        self._matched_before = features.keypoints, descriptors
         return MatchedFeatures(features, descriptors, matches)
 
     def track_matched(self, matched: MatchedFeatures, time: float) -> View:

@@ -57,6 +57,18 @@ def match_units(a: Float32, b: Float32, max_distance: float | None = None) -> In
     return np.stack([rows, nearest_in_b[rows]], axis=1)
 
 
+def without_strays(matches: Int64, keypoints_a: Float32, keypoints_b: Float32, limit: float) -> Int64:
+    """The pairs (K, 2) whose motion is at most `limit` pixels from the median motion of all.
+
+    Between frames of a video nothing jumps, so a pair far from what all others do is a mistaken identity. The median
+    goes along with a camera that turns fast.
+    """
+    if len(matches) == 0:
+        return matches
+    motion = keypoints_b[matches[:, 1]].astype(np.float64) - keypoints_a[matches[:, 0]]
+    return matches[np.linalg.norm(motion - np.median(motion, axis=0), axis=1) <= limit]
+
+
 @numba.njit(cache=True, nogil=True)
 def _nearest_both_ways(similarity):  # type: ignore[no-untyped-def]
     """Largest entry of each row and of each column in one pass (the first of equals), and the rows' largest values.
