@@ -10,6 +10,7 @@ from types import ModuleType
 STAGES = {
     "shapes": ("train_shapes", "a detector from drawn shapes alone (MagicPoint)"),
     "homographies": ("train_homographies", "detector and descriptor from any pictures, by homographic adaptation"),
+    "odometry": ("train_odometry", "all three heads from labelled video: VO adaptation"),
 }
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sivo.cli.options import settings_from
-from sivo.cli.train_options import OPTIMISER_FLAGS, add_training_arguments, need_torch, summary
+from sivo.cli.train_options import OPTIMISER_FLAGS, add_training_arguments, need_torch, starting_weights, summary
 from sivo.errors import InputError
 from sivo.files import check_output_folder
 from sivo.training.settings import HomographiesSettings
@@ -28,14 +28,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "sources", nargs="+", metavar="SOURCE[=WEIGHT]", help="image folder or sequence; a higher weight is seen more"
     )
-    parser.add_argument("--detector", type=Path, metavar="WEIGHTS", help="label the pictures with this detector")
+    parser.add_argument(
+        "--detector", metavar="WEIGHTS", help="label the pictures with this detector: a file, or a bundled name"
+    )
     parser.add_argument(
         "--data-card", type=Path, metavar="FILE", help="JSON list of name, licence, attribution for the model card"
     )
     parser.add_argument(
         "--descriptor-loss", default=argparse.SUPPRESS, help="info_nce, or hinge as SuperPoint has it (info_nce)"
     )
-    add_training_arguments(parser, HomographiesSettings().optimiser.batch_size)
+    add_training_arguments(parser, HomographiesSettings().optimiser)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -48,7 +50,12 @@ def run(arguments: argparse.Namespace) -> None:
     from sivo.training.stages import train_homographies
 
     metrics = train_homographies(
-        arguments.sources, settings, arguments.output, arguments.parent, arguments.detector, data
+        arguments.sources,
+        settings,
+        arguments.output,
+        starting_weights(arguments.parent),
+        starting_weights(arguments.detector),
+        data,
     )
     print(summary(arguments.output, metrics))
 

@@ -22,23 +22,50 @@ OPTIMISER_FLAGS = {
 }
 
 
-def add_training_arguments(parser: argparse.ArgumentParser, batch_size: int) -> None:
-    """Where to, from which weights, and the settings that change most often."""
-    defaults, absent = OptimiserSettings(), argparse.SUPPRESS
+def add_training_arguments(
+    parser: argparse.ArgumentParser, defaults: OptimiserSettings, parent: str | None = None
+) -> None:
+    """Where to, from which weights, and the settings that change most often.
+
+    Args:
+        defaults: of the stage.
+        parent: the weights that the stage starts from by default; their architecture is kept. None starts anew.
+    """
+    absent = argparse.SUPPRESS
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="OUT", help="folder; an unfinished one is continued"
     )
     parser.add_argument(
-        "--from", dest="parent", type=Path, metavar="WEIGHTS", help="weights to start from (default: random ones)"
+        "--from",
+        dest="parent",
+        default=parent,
+        metavar="WEIGHTS",
+        help="weights to start from: a file, or a bundled name",
     )
-    parser.add_argument("--architecture", default=absent, help="superpoint or superpoint-small (default: superpoint)")
+    if parent is None:
+        parser.add_argument(
+            "--architecture", default=absent, help="superpoint or superpoint-small (default: superpoint)"
+        )
     parser.add_argument("--steps", type=int, default=absent, help=f"of training (default: {defaults.steps})")
-    parser.add_argument("--batch-size", type=int, default=absent, metavar="N", help=f"(default: {batch_size})")
+    parser.add_argument("--batch-size", type=int, default=absent, metavar="N", help=f"(default: {defaults.batch_size})")
     parser.add_argument("--seed", type=int, default=absent, help=f"(default: {defaults.seed})")
     parser.add_argument("--device", default=absent, help="cpu, cuda or auto (default: auto)")
     parser.add_argument("--threads", type=int, default=absent, help="of torch on the CPU (default: its own choice)")
     parser.add_argument("--workers", type=int, default=absent, help=f"data processes (default: {defaults.workers})")
     add_config_arguments(parser)
+
+
+def starting_weights(parent: str | None) -> Path | None:
+    """The file that `--from` names.
+
+    Raises:
+        InputError: no such weights.
+    """
+    if parent is None:
+        return None
+    from sivo.frontend.weights import find_weights
+
+    return find_weights(parent)
 
 
 def need_torch() -> None:

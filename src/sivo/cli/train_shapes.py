@@ -8,14 +8,14 @@ from __future__ import annotations
 import argparse
 
 from sivo.cli.options import settings_from
-from sivo.cli.train_options import OPTIMISER_FLAGS, add_training_arguments, need_torch, summary
+from sivo.cli.train_options import OPTIMISER_FLAGS, add_training_arguments, need_torch, starting_weights, summary
 from sivo.files import check_output_folder
 from sivo.training.settings import ShapesSettings
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `sivo train shapes`."""
-    add_training_arguments(parser, ShapesSettings().optimiser.batch_size)
+    add_training_arguments(parser, ShapesSettings().optimiser)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -25,4 +25,4 @@ def run(arguments: argparse.Namespace) -> None:
     need_torch()
     from sivo.training.stages import train_shapes
 
-    print(summary(arguments.output, train_shapes(settings, arguments.output, arguments.parent)))
+    print(summary(arguments.output, train_shapes(settings, arguments.output, starting_weights(arguments.parent))))

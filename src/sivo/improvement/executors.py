@@ -1,12 +1,14 @@
-"""Doing many independent jobs: one after another in this process, or in several local processes."""
+"""Doing many independent jobs: one after another in this process, or in several local processes (Ray: `on_ray`)."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from sivo.errors import SivoError
@@ -15,8 +17,8 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 Tick = Callable[[], None]  # a job calls it as it goes on; raises KeyboardInterrupt when all is to stop
 
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_POLL_SECONDS = 0.2
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+POLL_SECONDS = 0.2
 
 _worker_ticks: Any = None  # set in worker processes
 _worker_stop: Any = None
@@ -50,35 +52,52 @@ def run_in_processes(
 ) -> None:
     """As `run_here`, in `workers` fresh processes with one BLAS thread each; results come as they are ready.
 
+    A process that dies is a `WorkerDiedError` of the job that it had; another takes its place for the jobs that wait.
+
     Args:
         work: a function of a module, since it is sent to the workers by name; so are the jobs and results.
     """
     context = multiprocessing.get_context("spawn")
-    ticks, stop = context.Value("q", 0), context.Event()
+    # No locks: a killed process would keep them. Each counter has one writer at a time.
+    stop = context.RawValue("b", 0)
+    counters = [context.RawValue("q", 0) for _ in range(min(workers, len(jobs)))]
+    waiting = deque(jobs)
+    running: dict[Future[Result], tuple[Job, int]] = {}
     told = 0
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))  # the workers' libraries read it when they load
-    try:
-        with ProcessPoolExecutor(workers, context, _start_worker, (ticks, stop)) as pool:
-            waiting: dict[Future[Result], Job] = {pool.submit(_work, work, job): job for job in jobs}
-            try:
-                while waiting:
-                    done, _ = wait(waiting, timeout=_POLL_SECONDS, return_when=FIRST_COMPLETED)
-                    told = _tell(ticks.value, told, on_ticks)
-                    for future in done:
-                        job = waiting.pop(future)
-                        on_result(job, _result(future))
-                _tell(ticks.value, told, on_ticks)
-            except BaseException:
-                stop.set()
+
+    def tell() -> None:
+        nonlocal told
+        count = sum(counter.value for counter in counters)
+        if count > told:
+            on_ticks(count - told)
+            told = count
+
+    with _one_blas_thread():
+        # A pool of one process per place, because a pool is lost as a whole when one of its processes dies.
+        pools = [ProcessPoolExecutor(1, context, _start_worker, (counter, stop)) for counter in counters]
+        try:
+            idle = list(range(len(pools)))
+            while waiting or running:
+                while waiting and idle:
+                    place, job = idle.pop(), waiting.popleft()
+                    running[pools[place].submit(_work, work, job)] = job, place
+                done, _ = wait(running, timeout=POLL_SECONDS, return_when=FIRST_COMPLETED)
+                tell()
+                for future in done:
+                    job, place = running.pop(future)
+                    result = _result(future)
+                    if isinstance(result, WorkerDiedError):
+                        pools[place].shutdown()
+                        pools[place] = ProcessPoolExecutor(1, context, _start_worker, (counters[place], stop))
+                    idle.append(place)
+                    on_result(job, result)
+            tell()
+        except BaseException:
+            stop.value = 1
+            raise
+        finally:
+            for pool in pools:
                 pool.shutdown(wait=True, cancel_futures=True)
-                raise
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def _result(future: Future[Any]) -> Any:
@@ -91,10 +110,19 @@ def _result(future: Future[Any]) -> Any:
         return error
 
 
-def _tell(count: int, told: int, on_ticks: Callable[[int], None]) -> int:
-    if count > told:
-        on_ticks(count - told)
-    return count
+@contextmanager
+def _one_blas_thread() -> Iterator[None]:
+    """For the processes that start meanwhile: their libraries read it when they load."""
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def _start_worker(ticks: Any, stop: Any) -> None:
@@ -111,9 +139,8 @@ def _start_worker(ticks: Any, stop: Any) -> None:
 
 def _work(work: Callable[[Job, Tick], Result], job: Job) -> Result:
     def tick() -> None:
-        with _worker_ticks.get_lock():
-            _worker_ticks.value += 1
-        if _worker_stop.is_set():
+        _worker_ticks.value += 1
+        if _worker_stop.value:
             raise KeyboardInterrupt
 
     return work(job, tick)

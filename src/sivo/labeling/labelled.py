@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,11 +13,16 @@ import yaml
 
 from sivo import config
 from sivo.errors import InputError
+from sivo.geometry.camera import Camera
+from sivo.geometry.se3 import inverse
 from sivo.labeling.frames import FRAMES_FILE, FramesTable, PackedImages, read_frames
+from sivo.labeling.settings import LabelSettings
 from sivo.labeling.store import DONE, SETTINGS_FILE, SequenceRecord, read_records
 from sivo.labeling.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
 from sivo.sequences.base import SequenceSettings
-from sivo.types import UInt8
+from sivo.types import Float64, UInt8
+
+RUN_FILE, TRAJECTORY_FILE = "run.json", "trajectory.txt"
 
 
 @dataclass(frozen=True)
@@ -26,6 +32,7 @@ class LabelledSequence:
     folder: Path
     record: SequenceRecord
     settings: SequenceSettings  # how its recording was read
+    rule: LabelSettings  # what the labels were made by
 
     @property
     def name(self) -> str:
@@ -46,6 +53,27 @@ class LabelledSequence:
     def frames(self) -> FramesTable:
         """One row per processed frame."""
         return read_frames(self.folder / FRAMES_FILE)
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The pinhole camera of the processed frames."""
+        try:
+            return Camera(**json.loads((self.folder / RUN_FILE).read_text())["camera"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{self.folder / RUN_FILE}: cannot be read ({error}); label it again") from None
+
+    @cached_property
+    def cam_from_world(self) -> Float64:
+        """(F, 4, 4) final poses by frame, NaN where there is none; a segment has its own world."""
+        from sivo.sequences import read_trajectory
+
+        posed = self.frames.segment >= 0
+        trajectory = read_trajectory(self.folder / TRAJECTORY_FILE)
+        if len(trajectory) != posed.sum():
+            raise InputError(f"{self.folder}: {TRAJECTORY_FILE} and {FRAMES_FILE} disagree; label it again")
+        poses = np.full((len(posed), 4, 4), np.nan)
+        poses[posed] = inverse(trajectory.world_from_cam)
+        return poses
 
     def image(self, frame: int) -> UInt8:
         """The grey image (H, W) at a position of the processed sequence, packed or from the recording.
@@ -76,9 +104,10 @@ def read_labels(folder: Path) -> list[LabelledSequence]:
     try:
         values = yaml.safe_load((folder / SETTINGS_FILE).read_text())
         settings = config.from_dict(SequenceSettings, values["sequence"], where=str(folder / SETTINGS_FILE))
+        rule = config.from_dict(LabelSettings, values["labels"], where=str(folder / SETTINGS_FILE))
     except (OSError, yaml.YAMLError, KeyError, TypeError):
         raise InputError(f"{folder}: is no label store; `sivo label SEQUENCE... -o {folder}` makes one") from None
     done = [record for record in records if record.state == DONE]
     if not done:
         raise InputError(f"{folder}: has no labelled sequence; see the reasons with `sivo label`, and run it again")
-    return [LabelledSequence(folder / record.name, record, settings) for record in done]
+    return [LabelledSequence(folder / record.name, record, settings, rule) for record in done]

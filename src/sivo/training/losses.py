@@ -21,7 +21,14 @@ def detector_loss(logits: Tensor, cells: Tensor) -> Tensor:
 
 
 def info_nce_loss(
-    a: Tensor, b: Tensor, points_a: Tensor, points_b: Tensor, valid: Tensor, scale: Tensor, masked_pixels: float
+    a: Tensor,
+    b: Tensor,
+    points_a: Tensor,
+    points_b: Tensor,
+    valid: Tensor,
+    scale: Tensor,
+    masked_pixels: float,
+    negative: Tensor | None = None,
 ) -> Tensor:
     """Symmetric InfoNCE over sparse correspondences: each descriptor must pick its partner among those of its pair.
 
@@ -30,11 +37,13 @@ def info_nce_loss(
         points_a, points_b: (B, N, 2) pixels; points nearer than `masked_pixels` in either view are not negatives.
         valid: (B, N) bool.
         scale: () inverse temperature.
+        negative: (B, N) bool, which rows may be wrong partners of others; the valid ones where it is not given.
     """
     similarity = scale * torch.einsum("bnd,bmd->bnm", a, b)
     near = (torch.cdist(points_a, points_a) < masked_pixels) | (torch.cdist(points_b, points_b) < masked_pixels)
     itself = torch.eye(a.shape[1], dtype=torch.bool, device=a.device)
-    refused = (near & ~itself) | ~valid[:, None, :] | ~valid[:, :, None]
+    negative = valid if negative is None else negative
+    refused = (near & ~itself) | ~negative[:, None, :] | ~negative[:, :, None]
     similarity = similarity.masked_fill(refused & ~itself, -1e4)
     forward = torch.logsumexp(similarity, dim=2)
     backward = torch.logsumexp(similarity, dim=1)
@@ -66,3 +75,15 @@ def hinge_loss(
     positive = positive_weight * (positive_margin - similarity).clamp(min=0)
     negative = (similarity - negative_margin).clamp(min=0)
     return (torch.where(same, positive, negative) * valid[:, :, None]).sum() / (valid.sum().clamp(min=1) * b.shape[1])
+
+
+def stability_loss(logits: Tensor, stability: Tensor) -> Tensor:
+    """Binary cross-entropy, balanced: stable and unstable points weigh the same, however many there are.
+
+    Args:
+        logits: (B, N, 2) at labelled points; channel 1 is "stable".
+        stability: (B, N) int64, 1 stable, 0 unstable, `IGNORED`.
+    """
+    errors = functional.cross_entropy(logits.transpose(1, 2), stability, ignore_index=IGNORED, reduction="none")
+    halves = [(errors * (stability == code)).sum() / (stability == code).sum().clamp(min=1) for code in (0, 1)]
+    return 0.5 * (halves[0] + halves[1])

@@ -14,7 +14,7 @@ class OptimiserSettings:
     learning_rate: float = 1.5e-3
     weight_decay: float = 1e-4
     warmup_steps: int = 50  # linear from zero
-    decay_steps: int = 4000  # the last steps, over which the rate falls linearly to zero
+    decay_steps: int = 4000  # the last steps, at most a third of all, over which the rate falls linearly to zero
     clip_norm: float = 5.0  # largest L2 norm of the gradient
     ema: float = 0.998  # decay of the moving average of the weights; the average is what is saved
     seed: int = 0
@@ -101,3 +101,48 @@ class ShapesSettings:
     views: ViewSettings = field(default_factory=ViewSettings)
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
     adaptation: AdaptationSettings = field(default_factory=AdaptationSettings)
+
+
+@dataclass(frozen=True)
+class LandmarkSettings:
+    """What labelled frames tell beyond the tracks that each of them holds; pixels are those of the training picture."""
+
+    shared: bool = True  # the tracks of one map point are judged together; False is the paper: each for itself
+    unseen: bool = True  # stable points are also known where only their projection shows them; False is the paper
+    reprojected: bool = True  # a stable point lies at its projection, not at the keypoint; False is the paper
+    largest_correction: float = 2.0  # pixels of the recording between the two; beyond it the keypoint holds
+    largest_view_angle_degrees: float = 40.0  # from the mean direction in which an unseen point was seen
+    largest_distance_ratio: float = 1.7  # to its mean distance, in either direction
+    occlusion_pixels: float = 14.0  # a nearer point within this radius hides an unseen one
+    occlusion_depth: float = 0.15  # by how much nearer, as a share
+
+
+@dataclass(frozen=True)
+class PairSettings:
+    """Which two frames make a pair, and what is taught about them."""
+
+    largest_gap: int = 60  # frames (paper, "Training Details")
+    wide_baselines: float = 0.5  # a gap is drawn with a density that rises with this power of it; 0 is uniform
+    same_frame_share: float = 0.3  # of the pairs show one frame twice, where every pixel's partner is known
+    least_points: int = 16  # correspondences that two frames must have; else nearer ones are taken
+    points: int = 256  # correspondences taught per pair
+    stability_points: int = 200  # labelled points taught per view, at most; as many unstable ones as there are
+    # a cell in which no keypoint was ever followed to a neighbouring frame is taught to have none; False ignores it
+    untracked_is_background: bool = True
+
+
+@dataclass(frozen=True)
+class OdometryTrainingSettings:
+    """`sivo train odometry`: VO adaptation, from label stores (paper, "Training Details")."""
+
+    longer_side: int = 320  # pixels; larger frames are reduced on loading
+    descriptor_weight: float = 1.0
+    stability_weight: float = 0.3
+    masked_pixels: float = 8.0  # points nearer than this are not each other's negatives
+    pairs: PairSettings = field(default_factory=PairSettings)
+    landmarks: LandmarkSettings = field(default_factory=LandmarkSettings)
+    optimiser: OptimiserSettings = field(
+        default_factory=lambda: OptimiserSettings(steps=2000, decay_steps=700, learning_rate=5e-4)
+    )
+    views: ViewSettings = field(default_factory=ViewSettings)
+    photometric: PhotometricSettings = field(default_factory=PhotometricSettings)

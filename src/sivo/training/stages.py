@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,14 +23,19 @@ from sivo.training.labels import PointLabels, load_labels, save_labels
 from sivo.training.magic_point import MagicPointStage
 from sivo.training.pairs import PairBatches
 from sivo.training.pictures import Pictures, load_pictures
-from sivo.training.settings import HomographiesSettings, ShapesSettings
+from sivo.training.settings import HomographiesSettings, OdometryTrainingSettings, ShapesSettings
 from sivo.training.synthetic import ShapeBatches, shape_source
 from sivo.training.trainer import Batches, Stage, Trainer, choose_device
 from sivo.training.widen import widen
 
+if TYPE_CHECKING:
+    from sivo.labeling.labelled import LabelledSequence
+
 WEIGHTS = "weights.safetensors"
 SETTINGS = "settings.yaml"
 LABELS = "labels.npz"
+StageSettings = ShapesSettings | HomographiesSettings | OdometryTrainingSettings
+LABEL_STORES = "label-stores.json"
 SHAPES = DataSource("procedural shapes", "Apache-2.0", "Drawn by sivo.training.shapes.")
 
 
@@ -84,10 +89,68 @@ def train_homographies(
     return _run(stage, PairBatches(pictures, labels, settings), settings, output, card, progress)
 
 
+def train_odometry(
+    labels: Sequence[Path],
+    settings: OdometryTrainingSettings,
+    output: Path,
+    start: Path,
+    data: tuple[DataSource, ...] = (),
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Stage 3, VO adaptation (paper, "Training Details"); returns the last row of metrics.
+
+    Args:
+        labels: label stores, as `sivo label` makes them; all their finished sequences are trained on.
+        start: weights to start from; the stability head starts from random ones where they have none.
+        data: what the model card says about the recordings; their names where it is empty.
+
+    Raises:
+        InputError: no store, a store whose labels have changed since the folder was begun, or no frame with enough
+            stable points.
+    """
+    from sivo.labeling.labelled import read_labels
+    from sivo.training.labelled_frames import LabelledFrames
+    from sivo.training.tracked_pairs import TrackedPairs
+    from sivo.training.vo_adaptation import VOAdaptationStage
+
+    sequences = [sequence for folder in labels for sequence in read_labels(folder)]
+    files.make_output_folder(output, "train odometry")
+    _same_labels(output / LABEL_STORES, sequences)
+    architecture = replace(load_weights(start).architecture, stability=True)
+    network, parent = _started(architecture, settings.optimiser.seed, start)
+    frames = [LabelledFrames(sequence, settings.longer_side, settings.landmarks) for sequence in sequences]
+    pairs = TrackedPairs(frames, settings)
+    if not sum(len(useful) for useful in pairs.useful):
+        least = settings.pairs.least_points
+        raise InputError(
+            f"{labels[0]}: no frame has {least} stable points; label more or livelier video, or lower "
+            "pairs.least_points"
+        )
+    if not data:
+        data = tuple(DataSource(sequence.name, "not stated") for sequence in sequences)
+    card = _card(network.architecture, "odometry", settings, data, parent)
+    card.training.update(
+        stability_trained=True,
+        sequences=len(sequences),
+        frames=sum(sequence.record.frames for sequence in sequences),
+        stable=sum(sequence.record.stable for sequence in sequences),
+        unstable=sum(sequence.record.unstable for sequence in sequences),
+    )
+    return _run(VOAdaptationStage(network, settings), pairs, settings, output, replace(card, notes=""), progress)
+
+
+def _same_labels(path: Path, sequences: Sequence[LabelledSequence]) -> None:
+    """Remember what a folder is trained on; refuse to continue it with other labels."""
+    now = [[s.name, s.record.frames, s.record.tracks, s.record.stable, s.record.unstable] for s in sequences]
+    if path.is_file() and json.loads(path.read_text()) != now:
+        raise InputError(f"{path.parent}: was begun with other labels; give the same stores or another output folder")
+    files.write_json(path, now)
+
+
 def _run(
     stage: Stage,
     batches: Batches,
-    settings: ShapesSettings | HomographiesSettings,
+    settings: StageSettings,
     output: Path,
     card: ModelCard,
     progress: bool,
@@ -114,12 +177,18 @@ def _network(name: str, seed: int, start: Path | None) -> tuple[SuperPoint, str]
     """A network without the stability head, which only VO adaptation can teach, and the name of its parent weights."""
     if name not in ARCHITECTURES:
         raise ConfigError(f"architecture {name}: unknown; choose among {', '.join(ARCHITECTURES)}")
+    return _started(replace(ARCHITECTURES[name], stability=False), seed, start)
+
+
+def _started(architecture: Architecture, seed: int, start: Path | None) -> tuple[SuperPoint, str]:
+    """A network with the given weights, widened where it is wider; what they lack stays random."""
     torch.manual_seed(seed)
-    network = SuperPoint(replace(ARCHITECTURES[name], stability=False))
+    network = SuperPoint(architecture)
     if start is None:
         return network, ""
     weights = load_weights(start)
-    own = {key: value for key, value in weights.tensors.items() if not key.startswith("stability.")}
+    heads = ("encoder", "detector", "descriptor", *(("stability",) if architecture.stability else ()))
+    own = {key: value for key, value in weights.tensors.items() if key.partition(".")[0] in heads}
     if _widths(weights.architecture) != _widths(network.architecture):
         own = widen(own, weights.architecture, network.architecture, np.random.default_rng(seed))
     network.load_state_dict({key: torch.from_numpy(value) for key, value in own.items()}, strict=False)
@@ -158,7 +227,7 @@ def loaded(weights: Weights) -> SuperPoint:
 def _card(
     architecture: Architecture,
     stage: str,
-    settings: ShapesSettings | HomographiesSettings,
+    settings: StageSettings,
     data: tuple[DataSource, ...],
     parent: str,
 ) -> ModelCard:
@@ -195,7 +264,7 @@ def _commit() -> str:
 _FREE = ("steps", "decay_steps", "device", "threads", "workers", "checkpoint_minutes", "log_every")
 
 
-def _same_settings(path: Path, settings: ShapesSettings | HomographiesSettings) -> None:
+def _same_settings(path: Path, settings: StageSettings) -> None:
     """Remember the settings of the folder; refuse to continue it under others."""
 
     def fixed(values: dict[str, Any]) -> dict[str, Any]:

@@ -208,7 +208,7 @@ class Trainer:
         """Share of the learning rate: linear warm-up, constant, linear fall to zero over the last steps."""
         settings = self.settings
         rising = (step + 1) / max(settings.warmup_steps, 1)
-        falling = (settings.steps - step) / max(settings.decay_steps, 1)
+        falling = (settings.steps - step) / max(min(settings.decay_steps, settings.steps // 3), 1)
         return min(1.0, rising, falling)
 
     def _follow(self) -> None:

@@ -1,0 +1,54 @@
+"""Adapt a network to video by visual odometry: train on the stability labels that `sivo label` made (the paper's step).
+
+Pairs of frames up to 60 apart, each under its own random homography: stable points teach detector and descriptor,
+stable against unstable ones the stability head, and what is unknown is ignored. Leaves weights.safetensors,
+weights.json (model card), metrics.jsonl and checkpoint.pt in OUT; run again to continue.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sivo.cli.options import settings_from
+from sivo.cli.train_homographies import read_data_card
+from sivo.cli.train_options import OPTIMISER_FLAGS, add_training_arguments, need_torch, summary
+from sivo.files import check_output_folder
+from sivo.training.settings import OdometryTrainingSettings
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `sivo train odometry`."""
+    defaults = OdometryTrainingSettings()
+    parser.add_argument(
+        "labels", nargs="+", type=Path, metavar="LABELS", help="label stores, as `sivo label` makes them"
+    )
+    parser.add_argument(
+        "--data-card", type=Path, metavar="FILE", help="JSON list of name, licence, attribution for the model card"
+    )
+    parser.add_argument(
+        "--only-tracks",
+        action="store_true",
+        help="the paper's correspondences: points only where a track saw them, at its keypoints",
+    )
+    add_training_arguments(parser, defaults.optimiser, parent="superpoint")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Train and print where the weights are."""
+    flags = {name: setting for name, setting in OPTIMISER_FLAGS.items() if name != "architecture"}
+    paper = (
+        ["landmarks.shared=false", "landmarks.unseen=false", "landmarks.reprojected=false"]
+        if arguments.only_tracks
+        else []
+    )
+    settings = settings_from(OdometryTrainingSettings, arguments, flags, paper)
+    check_output_folder(arguments.output, "train odometry")
+    data = read_data_card(arguments.data_card) if arguments.data_card else ()
+    need_torch()
+    from sivo.frontend.weights import find_weights
+    from sivo.training.stages import train_odometry
+
+    start = find_weights(arguments.parent)
+    metrics = train_odometry(arguments.labels, settings, arguments.output, start, data)
+    print(summary(arguments.output, metrics))
