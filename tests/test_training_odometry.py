@@ -1,0 +1,234 @@
+"""VO adaptation: what labelled frames tell, the pairs made of them, and that a network learns from it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="training needs the extra `train`")
+
+from labelled_scene import (  # noqa: E402
+    CAMERA,
+    FAR,
+    FRAMES,
+    HALF,
+    NEAR,
+    draw,
+    project,
+    scene_points,
+    write_labelled_scene,
+)
+from sivo.cli.main import main  # noqa: E402
+from sivo.frontend.architecture import Architecture  # noqa: E402
+from sivo.frontend.superpoint import SuperPoint, sample_stability  # noqa: E402
+from sivo.frontend.weights import ModelCard, load_weights, save_weights  # noqa: E402
+from sivo.labeling.labelled import read_labels  # noqa: E402
+from sivo.labeling.stability import IGNORE, STABLE, UNSTABLE  # noqa: E402
+from sivo.training.labelled_frames import LabelledFrames, common_points  # noqa: E402
+from sivo.training.labels import IGNORED  # noqa: E402
+from sivo.training.losses import info_nce_loss, stability_loss  # noqa: E402
+from sivo.training.settings import (  # noqa: E402
+    LandmarkSettings,
+    OdometryTrainingSettings,
+    OptimiserSettings,
+    PairSettings,
+    ViewSettings,
+)
+from sivo.training.stages import loaded  # noqa: E402
+from sivo.training.tracked_pairs import TrackedPairs  # noqa: E402
+
+TINY = Architecture("tiny", encoder=(4, 4, 4, 4, 8, 8, 8, 8), head=8, descriptor=8, stability=False)
+PAPER = LandmarkSettings(shared=False, unseen=False, reprojected=False)
+TRACKS_ONLY = LandmarkSettings(unseen=False, reprojected=False)
+LATE = HALF + 20  # a frame in which no track follows the odd far points any more
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_labelled_scene(tmp_path_factory.mktemp("scene") / "labels")
+
+
+@pytest.fixture(scope="module")
+def tiny_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    tensors = {name: value.numpy() for name, value in SuperPoint(TINY).state_dict().items()}
+    save_weights(path, tensors, ModelCard(architecture=TINY, licence="Apache-2.0"))
+    return path
+
+
+def frames_of(store: Path, settings: LandmarkSettings) -> LabelledFrames:
+    return LabelledFrames(read_labels(store)[0], 160, settings)
+
+
+def truth(frame: int, kind: str) -> np.ndarray:
+    """Pixels (N, 2) of odd far points (`odd`) or near ones (`near`) inside the frame."""
+    xyz = scene_points()
+    chosen = (xyz[:, 2] == FAR) & (np.arange(len(xyz)) % 2 == 1) if kind == "odd" else xyz[:, 2] == NEAR
+    pixels = np.array([project(point, frame) for point in xyz[chosen]])
+    return pixels[((pixels >= 0) & (pixels <= [CAMERA.width - 1, CAMERA.height - 1])).all(axis=1)]
+
+
+def distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(points[:, None] - others[None], axis=2).min(axis=1)
+
+
+def test_short_tracks_of_one_map_point_teach_together_and_in_the_paper_not(store: Path) -> None:
+    second_track = HALF + 5  # of six observations: too short for a label of its own
+    together, alone = (frames_of(store, settings).points(second_track) for settings in (TRACKS_ONLY, PAPER))
+    assert (alone.stability == IGNORE).sum() > 50
+    assert (together.stability == STABLE).sum() > (alone.stability == STABLE).sum() + 50
+    assert (together.stability == UNSTABLE).sum() == (alone.stability == UNSTABLE).sum() > 20
+    first = frames_of(store, TRACKS_ONLY).points(3)
+    rows_a, rows_b = common_points(first, together)
+    moved = first.points[rows_a] - together.points[rows_b]
+    depth = CAMERA.fx * 0.03 * (second_track - 3) / moved[:, 0]
+    assert len(rows_a) > 100
+    assert np.allclose(moved[:, 1], 0, atol=1e-3)
+    assert np.all(np.isclose(depth, FAR, rtol=1e-3) | np.isclose(depth, NEAR, rtol=1e-3))
+
+
+def test_a_point_that_no_track_sees_is_known_where_its_projection_is_visible(store: Path) -> None:
+    odd = truth(LATE, "odd")
+    odd = odd[project(np.array([1.6, 0, FAR]), LATE)[0] > odd[:, 0] + 2]  # the stable ones
+    hidden = distances(odd, truth(LATE, "near")) < 4
+    assert hidden.sum() >= 3
+    assert (~hidden).sum() > 30
+    tracked, everywhere = (frames_of(store, s).points(LATE) for s in (TRACKS_ONLY, LandmarkSettings()))
+    assert (distances(odd, tracked.points) > 0.5).mean() > 0.9
+    known = distances(odd, everywhere.points[everywhere.stability == STABLE]) < 1e-3
+    assert known[~hidden].mean() > 0.8
+    assert not known[hidden].any()
+
+
+def test_stable_points_lie_at_their_projections(tmp_path: Path) -> None:
+    noisy = write_labelled_scene(tmp_path / "noisy", keypoint_noise=0.8)
+    at_keypoint, at_projection = (frames_of(noisy, s).points(20) for s in (TRACKS_ONLY, LandmarkSettings(unseen=False)))
+    exact = np.array([project(point, 20) for point in scene_points()])
+    stable = at_keypoint.stability == STABLE
+    assert np.median(distances(at_keypoint.points[stable], exact)) > 0.2
+    assert distances(at_projection.points[at_projection.stability == STABLE], exact).max() < 1e-3
+
+
+def settings_of(**changes: Any) -> OdometryTrainingSettings:
+    optimiser = OptimiserSettings(
+        steps=120, batch_size=3, warmup_steps=5, threads=1, workers=0, learning_rate=5e-3, log_every=10, ema=0.9
+    )
+    settings = OdometryTrainingSettings(
+        longer_side=160, pairs=PairSettings(points=48, stability_points=60), optimiser=optimiser,
+        views=ViewSettings(height=64, width=96, rotation_degrees=20.0),
+    )  # fmt: skip
+    return replace(settings, **changes)
+
+
+def test_pairs_show_the_same_points_and_repeat_for_the_same_seed(store: Path) -> None:
+    # without augmentation of light the taught places can be looked at: the same dot has the same brightness
+    from sivo.training.settings import PhotometricSettings
+
+    plain = PhotometricSettings(
+        brightness=0, contrast=(1, 1), gamma=(1, 1), shade_share=0, vignette_share=0, blur_share=0, motion_share=0,
+        noise=0, speckle=0, jpeg_share=0,
+    )  # fmt: skip
+    upright = ViewSettings(64, 96, 1.0, 1.0, rotation_degrees=0, perspective=0, stretch=0)
+    settings = settings_of(photometric=plain, views=upright)
+    pairs = TrackedPairs([frames_of(store, LandmarkSettings())], settings)
+    agreeing, taught = 0, 0
+    for step in range(4):
+        batch = pairs[step]
+        images = batch["images"][:, 0].astype(float)
+        for a, b, points_a, points_b, valid in zip(
+            images[:3], images[3:], batch["points_a"], batch["points_b"], batch["valid"], strict=True
+        ):
+            for p, q in zip(points_a[valid].round().astype(int), points_b[valid].round().astype(int), strict=True):
+                agreeing += abs(a[p[1], p[0]] - b[q[1], q[0]]) < 25
+                taught += 1
+    assert taught > 200
+    assert agreeing / taught > 0.8  # dots overlap here and there; by chance it would be about a third
+    again = TrackedPairs([frames_of(store, LandmarkSettings())], settings)[3]
+    assert all(np.array_equal(again[name], batch[name]) for name in batch)
+    assert not np.array_equal(batch["images"], pairs[4]["images"])
+
+
+def test_the_detector_ignores_what_is_unknown(store: Path) -> None:
+    pairs = TrackedPairs([frames_of(store, PAPER)], settings_of())
+    values = np.concatenate([pairs[step]["cells"].ravel() for step in range(4)])
+    assert (values == IGNORED).any()
+    assert (values == 64).any()
+    assert (values < 64).any()
+    only_known = replace(settings_of().pairs, untracked_is_background=False)
+    values = TrackedPairs([frames_of(store, PAPER)], settings_of(pairs=only_known))[0]["cells"]
+    assert not (values == 64).any()
+    assert (values >= 0).any()
+
+
+def test_keypoints_without_a_partner_are_wrong_ones_for_the_others() -> None:
+    descriptors = torch.eye(3)[None]
+    places = torch.tensor([[[0.0, 0.0], [50.0, 0.0], [0.0, 50.0]]])
+    valid = torch.tensor([[True, False, False]])
+    scale = torch.tensor(2.0)
+    alone = info_nce_loss(descriptors, descriptors, places, places, valid, scale, 8.0)
+    among = info_nce_loss(
+        descriptors, descriptors, places, places, valid, scale, 8.0, negative=torch.tensor([[True, True, False]])
+    )
+    assert float(alone) == pytest.approx(0.0, abs=1e-6)
+    assert float(among) == pytest.approx(np.log(1 + np.exp(-2.0)), rel=1e-5)
+
+
+def test_the_stability_loss_is_balanced() -> None:
+    logits = torch.tensor([[[0.0, 2.0]] * 9 + [[0.0, 2.0]]])
+    stability = torch.tensor([[1] * 9 + [0]])
+    right, wrong = np.log(1 + np.exp(-2.0)), np.log(1 + np.exp(2.0))
+    assert float(stability_loss(logits, stability)) == pytest.approx(0.5 * (right + wrong), rel=1e-5)
+    assert float(stability_loss(logits, torch.full((1, 10), IGNORED))) == 0.0
+
+
+def test_the_command_teaches_stability_and_says_so_on_the_card(
+    store: Path, tiny_weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "settings.yaml"
+    from sivo.config import to_yaml
+
+    config.write_text(to_yaml(settings_of()))
+    command = ["train", "odometry", str(store), "-o", str(tmp_path / "out"), "--from", str(tiny_weights)]
+    assert main([*command, "--config", str(config)]) == 0
+    rows = [json.loads(row) for row in (tmp_path / "out" / "metrics.jsonl").read_text().splitlines()]
+    assert rows[-1]["stability"] < 0.6 * rows[0]["stability"]
+    assert rows[-1]["detector"] < rows[0]["detector"]
+    weights = load_weights(tmp_path / "out" / "weights.safetensors")
+    assert weights.card.training["stability_trained"] is True
+    assert weights.card.training["start"] == "tiny.safetensors"
+    network = loaded(weights)
+    known = frames_of(store, PAPER).points(5)
+    with torch.inference_mode():
+        image = torch.from_numpy(draw(5)[None, None]).float() / 255
+        logits = sample_stability(network(image).stability_logits, torch.from_numpy(known.points).float()[None])[0]
+    stable = (logits[:, 1] - logits[:, 0]).numpy()
+    assert np.mean(stable[known.stability == STABLE]) > np.mean(stable[known.stability == UNSTABLE]) + 1
+
+    other = write_labelled_scene(tmp_path / "other", name="other")
+    command[2] = str(other)
+    assert main([*command, "--config", str(config)]) == 2
+    assert "other labels" in capsys.readouterr().err
+
+
+def test_labels_without_enough_stable_points_are_one_line(
+    store: Path, tiny_weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["train", "odometry", str(store), "-o", str(tmp_path / "out"), "--from", str(tiny_weights)]
+    assert main([*command, "--set", "pairs.least_points=100000"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "stable points" in error
+    assert main(["train", "odometry", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
+
+
+def test_frames_that_are_useful_have_stable_points(store: Path) -> None:
+    frames = frames_of(store, PAPER)
+    assert len(frames) == FRAMES
+    assert len(frames.useful_frames(16)) == FRAMES
+    assert len(frames.useful_frames(100000)) == 0
