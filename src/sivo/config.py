@@ -90,6 +90,17 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings") -> 
         raise ConfigError(f"{where}: {error}") from None
 
 
+def first_difference(before: Any, now: Any, prefix: str = "") -> str:
+    """The first setting that differs between two nested dictionaries, in words; empty where none does."""
+    if not (isinstance(before, dict) and isinstance(now, dict)):
+        return "" if before == now else f"{prefix.rstrip('.')}={before}, now {now}"
+    for key in [*before, *(key for key in now if key not in before)]:
+        difference = first_difference(before.get(key), now.get(key), f"{prefix}{key}.")
+        if difference:
+            return difference
+    return ""
+
+
 def _strict(kind: type) -> Any:
     accepted = (int, float) if kind is float else kind
 
