@@ -6,18 +6,40 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from sivo.training.labels import IGNORED
+from sivo.training.labels import DUSTBIN, IGNORED
 
 
-def detector_loss(logits: Tensor, cells: Tensor) -> Tensor:
+def detector_loss(logits: Tensor, cells: Tensor, position_weight: float = 0.0, position_sigma: float = 0.7) -> Tensor:
     """Softmax cross-entropy over the 65 classes of a cell; ignored cells count for nothing (paper, "Training Details").
+
+    Most cells have no keypoint, so this alone teaches for a long time only whether there is one. The position term,
+    which SuperPoint does not have, is the cross-entropy over the 64 pixels of the cells that have one, against a small
+    Gaussian about the keypoint.
 
     Args:
         logits: (B, 65, Hc, Wc).
         cells: (B, Hc, Wc) int64, 0..64 or `IGNORED`.
+        position_weight: of the position term; 0 is SuperPoint's loss.
+        position_sigma: pixels, of the Gaussian.
     """
-    total = functional.cross_entropy(logits.float(), cells, ignore_index=IGNORED, reduction="sum")
-    return total / (cells != IGNORED).sum().clamp(min=1)
+    logits = logits.float()
+    total = functional.cross_entropy(logits, cells, ignore_index=IGNORED, reduction="sum")
+    loss = total / (cells != IGNORED).sum().clamp(min=1)
+    if not position_weight:
+        return loss
+    taught = (cells >= 0) & (cells < DUSTBIN)
+    pixels = logits[:, :DUSTBIN].permute(0, 2, 3, 1)[taught]
+    targets = _gaussians(position_sigma).to(pixels)[cells[taught]]
+    position = functional.cross_entropy(pixels, targets, reduction="sum") / taught.sum().clamp(min=1)
+    return loss + position_weight * position
+
+
+def _gaussians(sigma: float) -> Tensor:
+    """(64, 64) row k: weights of a cell's pixels for a keypoint at its pixel k, which add up to 1."""
+    side = torch.arange(8.0)
+    y, x = torch.meshgrid(side, side, indexing="ij")
+    places = torch.stack([x.flatten(), y.flatten()], dim=1)
+    return functional.softmax(-(torch.cdist(places, places) ** 2) / (2 * sigma**2), dim=1)
 
 
 def info_nce_loss(

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from sivo.frontend.superpoint import SuperPoint
 from sivo.training.losses import detector_loss
+from sivo.training.settings import DetectorLossSettings
 from sivo.training.trainer import Stage
 
 
@@ -14,12 +15,14 @@ class MagicPointStage(Stage):
 
     network: SuperPoint
 
-    def __init__(self, network: SuperPoint) -> None:
+    def __init__(self, network: SuperPoint, settings: DetectorLossSettings | None = None) -> None:
         super().__init__()
         self.network = network
+        self.settings = settings or DetectorLossSettings()
         network.descriptor.requires_grad_(False)
 
     def losses(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """See `Stage`; `batch` is that of `ShapeBatches`."""
         logits = self.network.detector(self.network.encode(batch["images"]))
-        return {"loss": detector_loss(logits, batch["cells"])}
+        weight, sigma = self.settings.position_weight, self.settings.position_sigma
+        return {"loss": detector_loss(logits, batch["cells"], weight, sigma)}

@@ -28,12 +28,20 @@ class OptimiserSettings:
 
 
 @dataclass(frozen=True)
+class DetectorLossSettings:
+    """What the detector head is taught beside SuperPoint's own loss."""
+
+    position_weight: float = 1.0  # of the term that says where in its cell a keypoint is; 0 is SuperPoint's loss
+    position_sigma: float = 0.7  # pixels; how sharply
+
+
+@dataclass(frozen=True)
 class ViewSettings:
     """Random views of a picture, as a moving camera would see it."""
 
     height: int = 120
     width: int = 160
-    smallest_zoom: float = 0.55  # pixels of the picture per pixel of the view, log-uniform
+    smallest_zoom: float = 0.7  # pixels of the picture per pixel of the view, log-uniform
     largest_zoom: float = 2.0
     rotation_degrees: float = 45.0  # largest in-plane rotation between a view and the picture
     perspective: float = 0.2  # largest displacement of a corner, as a share of the view's side
@@ -52,9 +60,9 @@ class PhotometricSettings:
     shade: float = 0.55  # largest darkening or brightening of a soft ellipse
     vignette_share: float = 0.2
     blur_share: float = 0.25
-    blur_sigma: float = 1.5  # pixels, largest
+    blur_sigma: float = 1.2  # pixels, largest
     motion_share: float = 0.3
-    motion_length: int = 8  # pixels, longest
+    motion_length: int = 5  # pixels, longest
     noise: float = 14.0  # grey levels, largest standard deviation
     speckle: float = 0.0015  # largest share of pixels that become black or white
     jpeg_share: float = 0.3
@@ -86,6 +94,7 @@ class HomographiesSettings:
     descriptor_weight: float = 1.0
     points: int = 256  # correspondences a pair; half of them at labelled keypoints
     masked_pixels: float = 8.0  # points nearer than this are not each other's negatives
+    detector: DetectorLossSettings = field(default_factory=DetectorLossSettings)
     optimiser: OptimiserSettings = field(default_factory=OptimiserSettings)
     views: ViewSettings = field(default_factory=ViewSettings)
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
@@ -97,6 +106,7 @@ class ShapesSettings:
     """`sivo train shapes`: a detector from drawn shapes alone ("MagicPoint")."""
 
     architecture: str = "superpoint"
+    detector: DetectorLossSettings = field(default_factory=DetectorLossSettings)
     optimiser: OptimiserSettings = field(default_factory=lambda: OptimiserSettings(batch_size=32))
     views: ViewSettings = field(default_factory=ViewSettings)
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
@@ -139,6 +149,7 @@ class OdometryTrainingSettings:
     descriptor_weight: float = 1.0
     stability_weight: float = 0.3
     masked_pixels: float = 8.0  # points nearer than this are not each other's negatives
+    detector: DetectorLossSettings = field(default_factory=DetectorLossSettings)
     pairs: PairSettings = field(default_factory=PairSettings)
     landmarks: LandmarkSettings = field(default_factory=LandmarkSettings)
     optimiser: OptimiserSettings = field(

@@ -45,7 +45,7 @@ def train_shapes(
     """Stage 1: a detector from drawn shapes alone; returns the last row of metrics."""
     network, parent = _network(settings.architecture, settings.optimiser.seed, start)
     card = _card(network.architecture, "shapes", settings, (SHAPES,), parent)
-    return _run(MagicPointStage(network), ShapeBatches(settings), settings, output, card, progress)
+    return _run(MagicPointStage(network, settings.detector), ShapeBatches(settings), settings, output, card, progress)
 
 
 def train_homographies(
