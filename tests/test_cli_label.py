@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -106,7 +107,7 @@ def test_packed_frames_need_no_recording(walks: list[Path], tmp_path: Path) -> N
     (sequence,) = read_labels(out)
     moved = sequence.folder.rename(tmp_path / "elsewhere")
     assert len(list(moved.glob("images-*.parquet"))) == 1
-    packed = type(sequence)(moved, sequence.record, sequence.settings).image(5)
+    packed = replace(sequence, folder=moved).image(5)
     picture = cv2.imread(str(walks[0] / "000005.png"), cv2.IMREAD_GRAYSCALE)
     assert np.abs(packed.astype(int) - picture).mean() < 3
 

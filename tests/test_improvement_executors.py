@@ -62,3 +62,15 @@ def test_an_interrupt_stops_the_workers():
 
     with pytest.raises(KeyboardInterrupt):
         run_in_processes(count_until_stopped, [1, 2, 3, 4], lambda job, result: None, interrupt, 2)
+
+
+def die_on_one(number: int, tick: Tick) -> int:
+    if number == 1:
+        os._exit(1)
+    return number
+
+
+def test_the_jobs_of_other_workers_survive_one_that_dies():
+    results, _ = run(die_on_one, [1, 2, 3, 4, 5], 2)
+    assert isinstance(results.pop(1), WorkerDiedError)
+    assert results == {2: 2, 3: 3, 4: 4, 5: 5}

@@ -46,7 +46,7 @@ def check_output_folder(path: Path, command: str) -> None:
     """
     if path.exists() and not path.is_dir():
         raise OutputError(f"{path}: is a file, not a folder; choose another output folder")
-    if path.is_dir() and any(path.iterdir()):
+    if path.is_dir() and any(not _is_temporary(entry) for entry in path.iterdir()):
         owner = _owner(path)
         if owner != command:
             made_by = f"was made by `sivo {owner}`" if owner else "has files that sivo did not write"
@@ -64,6 +64,11 @@ def make_output_folder(path: Path, command: str) -> None:
     except OSError as error:
         raise OutputError(f"{path}: cannot be created ({error.strerror}); choose another output folder") from None
     write_json(path / MARKER, {"made_by": command})
+
+
+def _is_temporary(path: Path) -> bool:
+    """Whether `written_atomically` left this, in a process that was killed; it may have been the first file of all."""
+    return path.name.startswith(".") and ".partial" in path.suffixes
 
 
 def _owner(path: Path) -> str | None:

@@ -23,7 +23,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "sequences", type=Path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
     )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="LABELS", help="folder of the label store")
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help="sequences at a time, a process for each")
+    parser.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="sequences at a time, a process for each (default: 1; with --ray, the cluster's cores)",
+    )
+    parser.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="do the work on a Ray cluster (host:port, `auto`, or `local`) whose nodes share these folders",
+    )
     parser.add_argument("--pack", action="store_true", help="keep the frames beside the labels, to train elsewhere")
     parser.add_argument(
         "--relabel", action="store_true", help="where LABELS was made with other settings, label all of it anew"
@@ -64,6 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
             workers=arguments.workers,
             pack=arguments.pack,
             relabel=arguments.relabel,
+            ray=arguments.ray,
             on_record=on_record,
             on_frames=on_frames,
         )

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from sivo.config import to_dict
-from sivo.errors import InputError, SivoError
+from sivo.errors import InputError, OutputError, SivoError
 from sivo.improvement.executors import Tick, run_here, run_in_processes
+from sivo.improvement.on_ray import run_on_ray
 from sivo.labeling.frames import FRAMES_FILE, FramesTable, pack_images, write_frames
 from sivo.labeling.store import DONE, FAILED, LabelStore, SequenceRecord, sequence_names
 from sivo.labeling.tables import POINTS_FILE, TRACKS_FILE, PointsWriter, read_points, read_tracks
@@ -38,9 +39,10 @@ def label_sequences(
     paths: Sequence[Path],
     folder: Path,
     settings: RunSettings,
-    workers: int = 1,
+    workers: int | None = None,
     pack: bool = False,
     relabel: bool = False,
+    ray: str | None = None,
     on_record: Callable[[SequenceRecord], None] = lambda record: None,
     on_frames: Callable[[int], None] = lambda count: None,
 ) -> list[SequenceRecord]:
@@ -48,6 +50,8 @@ def label_sequences(
 
     Args:
         folder: of the label store, see `sivo.labeling.store`.
+        workers: sequences at a time, a process for each; one, or with `ray` as many as the cluster has cores, if None.
+        ray: address of a Ray cluster that does the work, see `sivo.improvement.on_ray`.
         on_record: is told each sequence as it is done, has failed, or was done before.
         on_frames: is told the number of further frames processed.
 
@@ -55,36 +59,37 @@ def label_sequences(
         The records of the given recordings, in their order.
 
     Raises:
-        InputError: none of them could be labelled.
+        InputError: none of them could be labelled, or there is no Ray cluster.
+        MissingExtraError: Ray is not installed.
         OutputError, ConfigError: the store cannot be used, see `LabelStore`.
     """
     names = sequence_names(list(paths))
     store = LabelStore(folder, _fingerprint(settings, pack), relabel)
     before = {record.name: record for record in store.records() if record.state == DONE}
-    for name in names:
-        if name in before:
-            if before[name].path != str(names[name]):
-                raise InputError(f"{names[name]}: the store has another recording named {name}; rename one of them")
-            on_record(before[name])
+    records = {name: before[name] for name in names if name in before}
+    for name, record in records.items():
+        if record.path != str(names[name]):
+            raise InputError(f"{names[name]}: the store has another recording named {name}; rename one of them")
+        on_record(record)
     jobs = [
         LabelJob(name, path, store.partial(name), settings, pack) for name, path in names.items() if name not in before
     ]
 
     def on_result(job: LabelJob, result: SequenceRecord | Exception) -> None:
-        record = result if isinstance(result, SequenceRecord) else _failure(job, result)
-        if record.state == DONE:
-            store.finish(record)
-        else:
-            store.fail(record)
-        on_record(record)
+        records[job.name] = _stored(store, job, result)
+        on_record(records[job.name])
 
-    if workers <= 1 or len(jobs) <= 1:
+    if ray is not None and jobs:
+        run_on_ray(label_sequence, jobs, on_result, on_frames, ray, workers)
+    elif len(jobs) <= 1 or (workers or 1) <= 1:
         run_here(label_sequence, jobs, on_result, on_frames)
     else:
-        run_in_processes(label_sequence, jobs, on_result, on_frames, min(workers, len(jobs)))
-    store.write_manifest()
-    records = {record.name: record for record in store.records()}
-    if not any(records[name].state == DONE for name in names):
+        run_in_processes(label_sequence, jobs, on_result, on_frames, min(workers or 1, len(jobs)))
+    try:
+        store.write_manifest()
+    except OutputError as error:  # the labels do not need it, and the next run writes it
+        logger.warning("%s", error)
+    if not any(record.state == DONE for record in records.values()):
         first = records[next(iter(names))]
         raise InputError(f"nothing could be labelled; {first.name}: {first.reason}")
     return [records[name] for name in names]
@@ -150,6 +155,22 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
         packed=job.pack,
         seconds=round(time.perf_counter() - started, 3),
     )
+
+
+def _stored(store: LabelStore, job: LabelJob, result: SequenceRecord | Exception) -> SequenceRecord:
+    """Put a result in its place; whatever goes wrong with it, such as a full disk, is a failure of this one."""
+    if isinstance(result, SequenceRecord):
+        try:
+            store.finish(result)
+            return result
+        except (SivoError, OSError) as error:
+            result = error
+    record = _failure(job, result)
+    try:
+        store.fail(record)
+    except OutputError as error:
+        logger.warning("%s", error)
+    return record
 
 
 def _failure(job: LabelJob, error: Exception) -> SequenceRecord:

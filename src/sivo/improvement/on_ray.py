@@ -7,6 +7,7 @@ same version of this package installed.
 from __future__ import annotations
 
 import os
+import socket
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,8 @@ from sivo.errors import InputError, MissingExtraError
 from sivo.improvement.executors import ONE_THREAD, POLL_SECONDS, Job, Result, Tick, WorkerDiedError
 
 _WAITING_PER_CORE = 2  # jobs handed to the cluster ahead of their turn
+_CANCEL_SECONDS = 10.0
+_PROBE_SECONDS = 5.0
 
 
 def run_on_ray(
@@ -64,7 +67,8 @@ def run_on_ray(
         except BaseException:
             for reference in running:
                 ray.cancel(reference)
-            ray.wait(list(running), num_returns=len(running), timeout=10.0) if running else None
+            if running:
+                ray.wait(list(running), num_returns=len(running), timeout=_CANCEL_SECONDS)
             raise
 
 
@@ -83,6 +87,7 @@ class _Counter:
 
 def _work(work: Callable[[Job, Tick], Result], job: Job, counter: Any, folder: str) -> Result:
     """On a node: paths mean what they mean to the caller; ticks are told now and then."""
+    import platform
     import time
 
     import cv2
@@ -90,7 +95,7 @@ def _work(work: Callable[[Job, Tick], Result], job: Job, counter: Any, folder: s
     try:
         os.chdir(folder)
     except OSError:
-        raise InputError(f"{folder}: is not there on node {os.uname().nodename}; all nodes need the same files") from None
+        raise InputError(f"{folder}: is not there on {platform.node()}; all nodes need the same files") from None
     cv2.setNumThreads(1)
     untold, last = 0, time.monotonic()
 
@@ -138,7 +143,10 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
         yield
         return
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a cluster started here reports to nobody
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
     try:
+        if colon and port.isdigit():  # Ray itself would try for minutes, and end the process
+            socket.create_connection((host, int(port)), _PROBE_SECONDS).close()
         ray.init(address=address, runtime_env={"env_vars": ONE_THREAD}, log_to_driver=False, logging_level="ERROR")
     except (ConnectionError, ValueError, RuntimeError, OSError) as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -18,6 +18,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -77,10 +78,16 @@ class LabelStore:
                 changed = _changed(yaml.safe_load(before.read_text()), settings)
                 raise ConfigError(f"{folder}: its labels were made with {changed}; use another folder, or --relabel")
             for record in self.records():
-                shutil.rmtree(folder / record.name, ignore_errors=True)
+                if record.state == DONE:
+                    (folder / record.name).rename(self.partial(record.name))  # never a sequence that is half there
+                else:
+                    self._failure(record.name).unlink(missing_ok=True)
         make_output_folder(folder, _COMMAND)
-        for leftover in folder.glob(".*.partial"):
-            shutil.rmtree(leftover, ignore_errors=True)
+        for leftover in folder.glob(".*.partial*"):
+            if leftover.is_dir():
+                shutil.rmtree(leftover, ignore_errors=True)
+            else:
+                leftover.unlink(missing_ok=True)
         write_text(before, text)
 
     def records(self) -> list[SequenceRecord]:
@@ -106,13 +113,13 @@ class LabelStore:
         except OSError as error:
             raise OutputError(f"{final}: cannot be put in place ({error.strerror}); remove what is there") from None
         self._failure(record.name).unlink(missing_ok=True)
-        self.write_manifest()
+        self._refresh_manifest()
 
     def fail(self, record: SequenceRecord) -> None:
         """The sequence cannot be labelled: keep the reason, drop the rest. The next run tries again."""
         shutil.rmtree(self.folder / f".{record.name}.partial", ignore_errors=True)
         write_json(self._failure(record.name), asdict(record))
-        self.write_manifest()
+        self._refresh_manifest()
 
     def write_manifest(self) -> None:
         """`manifest.parquet` from what is there."""
@@ -124,6 +131,11 @@ class LabelStore:
         table = pa.Table.from_pylist([asdict(record) for record in self.records()], schema)
         with written_atomically(self.folder / MANIFEST_FILE) as temporary:
             pq.write_table(table, temporary)
+
+    def _refresh_manifest(self) -> None:
+        """On the way: the folders are what counts, so a full disk is no failure of this sequence."""
+        with suppress(OutputError):
+            self.write_manifest()
 
     def _failure(self, name: str) -> Path:
         return self.folder / f".{name}.failed.json"
@@ -138,15 +150,16 @@ def read_records(folder: Path) -> list[SequenceRecord]:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; `sivo label` makes it")
     files = [*folder.glob(f"*/{RECORD_FILE}"), *folder.glob(".*.failed.json")]
-    records = []
+    records: dict[str, SequenceRecord] = {}
     for file in files:
         if file.parent.name.endswith(".partial"):
             continue
         try:
-            records.append(SequenceRecord(**json.loads(file.read_text())))
+            record = SequenceRecord(**json.loads(file.read_text()))
         except (OSError, ValueError, TypeError):
             raise InputError(f"{file}: is damaged; remove it and run `sivo label` again") from None
-    return sorted(records, key=lambda record: record.name)
+        records.setdefault(record.name, record)  # labels come before an older failure of the same sequence
+    return sorted(records.values(), key=lambda record: record.name)
 
 
 def sequence_names(paths: list[Path]) -> dict[str, Path]:
