@@ -16,6 +16,7 @@ from sivo.errors import SivoError
 # a verb with its own sub-commands adds them with `parser.add_subparsers`. Heavy imports belong inside `run`.
 COMMANDS: dict[str, tuple[str, str]] = {
     "label": ("label", "stability labels for many sequences: odometry, then the paper's rule"),
+    "improve": ("improve", "the main job: label video, train the frontend with the labels, keep it if it got better"),
     "run": ("run", "visual odometry on one sequence: trajectory, map, tracks"),
     "evaluate": ("evaluate", "how good a frontend or a trajectory is: the paper's protocols"),
     "train": ("train", "teach the network: drawn shapes, homographies"),

@@ -6,15 +6,13 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-
-import numpy as np
 
 from sivo import config
 from sivo.errors import InputError
-from sivo.files import write_json
-from sivo.labeling.store import DONE, SequenceRecord
+from sivo.files import MARKER, write_json
+from sivo.labeling.store import DONE, RECORD_FILE, SETTINGS_FILE, SequenceRecord, sequence_names
 from sivo.sequences import SequenceSettings, open_sequence
 
 _MIN_FRAMES = 3  # of each part
@@ -85,8 +83,8 @@ def whole_sequences(records: Sequence[SequenceRecord], sequence: SequenceSetting
     paths = [Path(record.path) for record in records if record.state == DONE]
     if len(paths) == 1:
         return replace(last_part(paths[0], sequence, share), unusable=unusable)
-    count = max(1, round(len(paths) * share))
-    chosen = {round(row) for row in np.linspace(len(paths) / count, len(paths), count) - 1}
+    count = min(max(1, round(len(paths) * share)), len(paths) - 1)
+    chosen = {-(-len(paths) * (part + 1) // count) - 1 for part in range(count)}  # rounded up: never the first
     held = [path for row, path in enumerate(paths) if row in chosen]
     rest = [path for row, path in enumerate(paths) if row not in chosen]
     return Split(Part(tuple(rest), sequence), Part(tuple(held), sequence), _words(held), unusable)
@@ -107,21 +105,24 @@ def remembered(path: Path, choose: Callable[[], Split]) -> Split:
     return split
 
 
-def share_labels(store: Path, names: Sequence[str], target: Path) -> None:
-    """Put sequences of one label store into a new one of the same settings, so that they need not be labelled twice.
+def share_labels(store: Path, records: Sequence[SequenceRecord], part: Part, target: Path) -> None:
+    """Put the part's sequences of one label store into another of the same settings: they are not labelled twice.
 
     Files are hard links where the file system has them, copies elsewhere.
     """
+    by_path = {record.path: record for record in records}
     target.mkdir(parents=True, exist_ok=True)
-    for name in names:
+    for name in (MARKER, SETTINGS_FILE):
+        shutil.copy2(store / name, target / name)
+    for name, path in sequence_names(list(part.paths)).items():
+        record = by_path[str(path)]
         partial, final = target / f".{name}.partial", target / name
         if final.exists():
             continue
         shutil.rmtree(partial, ignore_errors=True)
-        shutil.copytree(store / name, partial, copy_function=_link)
+        shutil.copytree(store / record.name, partial, copy_function=_link)
+        write_json(partial / RECORD_FILE, asdict(replace(record, name=name)))
         partial.rename(final)
-    for name in (".sivo.json", "settings.yaml"):
-        shutil.copy2(store / name, target / name)
 
 
 def _link(source: str, target: str) -> str:

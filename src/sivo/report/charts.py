@@ -32,7 +32,8 @@ def line_chart(x: Float64, y: Float64, label: str, most: float | None = None) ->
             f'<line x1="{_LEFT}" x2="{_WIDTH - 8}" y1="{row:.1f}" y2="{row:.1f}" stroke="currentColor" opacity=".15"/>'
             f'<text x="{_LEFT - 6}" y="{row + 4:.1f}" text-anchor="end">{value:g}</text>'
         )
-    for value in np.linspace(left, right, 6):
+    columns = np.arange(left, right + 1) if right - left < 6 else np.linspace(left, right, 6)
+    for value in columns:
         column = (value - left) / max(right - left, 1e-12) * (_WIDTH - _LEFT - 8) + _LEFT
         parts.append(f'<text x="{column:.1f}" y="{_HEIGHT - 5}" text-anchor="middle">{value:.0f}</text>')
     breaks = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))

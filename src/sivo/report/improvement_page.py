@@ -31,10 +31,17 @@ class Round:
     labels: dict[str, int] = field(default_factory=dict)  # tracks by label, as made with this frontend
     seconds: dict[str, float] = field(default_factory=dict)  # by stage: label, train, evaluate
     pictures: tuple[tuple[Path, str], ...] = ()  # PNG files with their captions
+    losses: dict[str, list[float]] = field(default_factory=dict)  # of its training by name, and `step`
 
 
 def write_improvement_page(
-    path: Path, title: str, lead: str, measures: Sequence[Measure], rounds: Sequence[Round], notes: Sequence[str] = ()
+    path: Path,
+    title: str,
+    lead: str,
+    measures: Sequence[Measure],
+    rounds: Sequence[Round],
+    notes: Sequence[str] = (),
+    best: int = -1,
 ) -> None:
     """Write the page.
 
@@ -45,8 +52,9 @@ def write_improvement_page(
         measures: in the order of their weight; the first heads the page.
         rounds: at least one; the first is the frontend before.
         notes: what the reader should know, in plain words.
+        best: the round that is held against the first.
     """
-    first, last = rounds[0], rounds[-1]
+    first, last = rounds[0], rounds[best]
     page = Page(title, lead)
     page.tiles(
         [
@@ -65,6 +73,10 @@ def write_improvement_page(
     )
     for measure in measures:
         page.paragraph(f"{measure.name}: {measure.meaning}", note=True)
+    for position in range(max(len(entry.pictures) for entry in rounds)):
+        for entry in (first, last) if last is not first else (first,):
+            for picture, caption in entry.pictures[position : position + 1]:
+                page.picture(picture, f"{entry.name}: {caption}")
     if len(rounds) > 2:
         _curves(page, measures, rounds)
     page.heading("Labels")
@@ -80,8 +92,7 @@ def write_improvement_page(
             page.html(f"<h3>{_plain(entry.name)}</h3>")
             page.bars(("stage", "seconds"), [(name, value, f"{value:.1f}") for name, value in entry.seconds.items()])
     for entry in rounds:
-        for picture, caption in entry.pictures:
-            page.picture(picture, f"{entry.name}: {caption}")
+        _losses(page, entry)
     page.write(path)
 
 
@@ -121,6 +132,17 @@ def _curves(page: Page, measures: Sequence[Measure], rounds: Sequence[Round]) ->
         y = np.array([entry.values.get(measure.name, np.nan) for entry in rounds])
         chart = line_chart(x, y, f"{measure.name} over the rounds")
         page.html(f"<figure>{chart}<figcaption>{_plain(measure.name)} over the rounds.</figcaption></figure>")
+
+
+def _losses(page: Page, entry: Round) -> None:
+    """How the training of a round went."""
+    names = [name for name in entry.losses if name != "step"]
+    if not names or len(entry.losses["step"]) < 2:
+        return
+    page.heading(f"Training of {entry.name}")
+    for name in names:
+        chart = line_chart(np.array(entry.losses["step"]), np.array(entry.losses[name]), f"{name} over the steps")
+        page.html(f"<figure>{chart}<figcaption>Loss over the steps: {_plain(name)}.</figcaption></figure>")
 
 
 def _plain(text: str) -> str:

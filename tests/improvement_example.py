@@ -1,0 +1,81 @@
+"""A small self-improvement for tests: two fifths of a second of training stand in for hours of it.
+
+Run as a program, it does one run of the loop: `improvement_example.py OUT SECONDS SEQUENCE...`.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sivo.evaluation.settings import SurvivalSettings
+from sivo.files import make_output_folder, write_json
+from sivo.frontend.weights import load_weights, save_weights
+from sivo.improvement.improve import Improvement, improve
+from sivo.improvement.settings import ImproveSettings, JudgeSettings
+from sivo.labeling.settings import LabelSettings
+from sivo.odometry.run_settings import FrontendSettings
+from sivo.training.settings import OdometryTrainingSettings
+
+SETTINGS = ImproveSettings(
+    frontend=FrontendSettings("superpoint-small", max_keypoints=250),
+    labels=LabelSettings(min_observations=6),
+    judge=JudgeSettings(SurvivalSettings(gaps=(4, 8), pairs=6, min_pairs=2), calibration_images=2),
+)
+
+
+class FakeTraining:
+    """Changes the weights a little, as told; what it was given is kept.
+
+    Args:
+        noise: relative change of all weights, one number a round; 0 leaves them as they are.
+        seconds: that a round takes.
+    """
+
+    def __init__(self, noise: Sequence[float] = (1e-3,), seconds: float = 0.0) -> None:
+        self.noise, self.seconds = noise, seconds
+        self.calls: list[dict[str, Any]] = []
+
+    def __call__(
+        self,
+        labels: Sequence[Path],
+        settings: OdometryTrainingSettings,
+        output: Path,
+        start: Path,
+        data: Any = (),
+        progress: bool = True,
+    ) -> dict[str, Any]:
+        self.calls.append({"labels": list(labels), "seed": settings.optimiser.seed, "start": start})
+        make_output_folder(output, "train odometry")
+        for part in range(20):  # as steps: something to interrupt
+            time.sleep(self.seconds / 20)
+            write_json(output / "checkpoint.json", part)
+        seed = settings.optimiser.seed
+        rng, noise = np.random.default_rng(seed), self.noise[min(seed, len(self.noise) - 1)]
+        weights = load_weights(start)
+        tensors = {
+            name: (value * (1 + noise * rng.standard_normal(value.shape))).astype(np.float32)
+            for name, value in sorted(weights.tensors.items())
+        }
+        rows = [{"step": step, "loss": 1.0 / step} for step in (1, 2, 3)]
+        (output / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+        card = replace(weights.card, activation_ranges={}, training={"stage": "odometry", "seconds": 1})
+        save_weights(output / "weights.safetensors", tensors, card)
+        return rows[-1]
+
+
+def run(output: Path, sequences: Sequence[Path], train: FakeTraining, rounds: int = 1, **options: Any) -> Improvement:
+    """One run of the loop."""
+    settings = options.pop("settings", SETTINGS)
+    return improve(list(sequences), output, settings, rounds, train=train, **options)
+
+
+if __name__ == "__main__":
+    run(Path(sys.argv[1]), [Path(word) for word in sys.argv[3:]], FakeTraining(seconds=float(sys.argv[2])), rounds=2)
