@@ -12,7 +12,7 @@ import pytest
 from sivo.cli.main import main
 from sivo.errors import InputError
 from sivo.evaluation.causes import PRECEDENCE, TrueCauses, track_causes
-from sivo.evaluation.stability import average_precision, paired_folders, roc_auc
+from sivo.evaluation.stability import average_precision, median_errors, paired_folders, roc_auc
 from sivo.evaluation.true_errors import true_track_errors
 from sivo.geometry.camera import Camera
 from sivo.geometry.se3 import inverse, rigid, transform
@@ -39,6 +39,16 @@ def test_average_precision_on_a_known_order() -> None:
     assert average_precision(score, np.array([True, False, True, False])) == pytest.approx(0.5 + 0.5 * 2 / 3)
     assert average_precision(np.ones(4), np.array([True, False, False, False])) == pytest.approx(0.25)
     assert average_precision(score, np.zeros(4, bool)) is None
+
+
+def test_median_errors_of_tracks() -> None:
+    track = np.array([7, 7, 2, 2, 2, 2, 7, 9])
+    error = np.array([5.0, 1.0, 4.0, np.nan, 1.0, 30.0, 2.0, 0.5], np.float32)
+    assert median_errors(track, error, np.array([2, 7])).tolist() == [4.0, 2.0]
+    error[track == 2] = [4.0, 2.0, 1.0, 30.0]
+    assert median_errors(track, error, np.array([9, 2])).tolist() == [0.5, 3.0]
+    with pytest.raises(InputError, match="no error"):
+        median_errors(track, error, np.array([3]))
 
 
 def _poses() -> np.ndarray:
@@ -98,6 +108,7 @@ def test_the_command_finds_the_causes(simulation: Path, labels: Path, tmp_path: 
     assert rows["moving"]["labelled"] >= 2
     assert rows["moving"]["recall"] == 1.0
     assert rows["moving"]["scores"]["label"]["roc_auc_followed"] == 1.0
+    assert rows["moving"]["scores"]["median_error"]["roc_auc"] == 1.0
     assert rows["wrong_links"]["labelled"] == 1
     assert subject["static"]["unstable"] == 1
     assert subject["static"]["followed"]["unstable"] == 0

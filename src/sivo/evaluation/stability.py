@@ -4,6 +4,10 @@ The positives are moving things and highlights (the headline), all causes togeth
 negatives are the points on static surfaces that nothing speaks against. Of tracks it is also known, from true poses and
 depth, which of those left their surface point: wrong links make a track unstable whatever it lies on. They are a row of
 their own, and every measure is given against all static points and against those that were followed.
+
+The label is made from the mean and the largest error of a track. Two graded scores are those; the third is the median
+error, which one wrong link in a good track does not move, but a thing that moves does: it tells the place from the
+accident.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ from numpy.typing import NDArray
 from sivo.errors import InputError
 from sivo.evaluation.causes import PRECEDENCE, TrueCauses, track_causes
 from sivo.evaluation.true_errors import true_track_errors
-from sivo.types import Float64
+from sivo.types import Float32, Float64, Int64
 
 HEADLINE = ("moving", "highlight")
 STRAYED = 5.0  # pixels from its true place, at which a track on a static surface counts as wrongly linked
@@ -99,6 +103,7 @@ def judge_labels(labels: Path, simulation: Path) -> Judged:
     unstable = points.stability[labelled] == UNSTABLE
     scores = {
         "label": unstable.astype(np.float64),
+        "median_error": median_errors(tracks.track, tracks.error, points.track[labelled]),
         "mean_error": points.mean_error[labelled].astype(np.float64),
         "max_error": points.max_error[labelled].astype(np.float64),
     }
@@ -117,6 +122,17 @@ def judge_labels(labels: Path, simulation: Path) -> Judged:
         )
     total = np.bincount(cause, minlength=len(PRECEDENCE)).astype(np.int64)
     return Judged(cause[labelled], scores, unstable, total, true_error)
+
+
+def median_errors(track: Int64, error: Float32, wanted: Int64) -> Float64:
+    """Median error (T,) of each wanted track, from rows of observations (M,); NaN rows do not count."""
+    known = np.isfinite(error)
+    order = np.lexsort((error[known], track[known]))
+    ids, sorted_error = track[known][order], error[known][order].astype(np.float64)
+    start, end = (np.searchsorted(ids, wanted, side=side) for side in ("left", "right"))
+    if not (end > start).all():
+        raise InputError("a labelled track has no error in tracks.parquet; run the sequence again")
+    return (sorted_error[start + (end - start - 1) // 2] + sorted_error[start + (end - start) // 2]) / 2
 
 
 def judge_frontend(frontend: Any, simulation: Path, stride: int = 10, threshold: float = 0.5) -> Judged:
