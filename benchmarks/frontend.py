@@ -126,13 +126,14 @@ def measure(weights: Weights, name: str, frames: tuple[UInt8, UInt8], arguments:
     batch = prepare(image)[None, None]
     before = int8(previous)
     maps = int8.runtime(batch)  # every later call writes the same numbers into the same arrays
-    features = decode(maps, 0, height, width, int8.settings)
+    grey = batch[0, 0]
+    features = decode(maps, 0, grey, int8.settings)
 
     timed: dict[str, Callable[[], Any]] = {
         "prepare": lambda: prepare(image),
         "network, OpenVINO float32": lambda: float32.runtime(batch),
         "network, OpenVINO int8": lambda: int8.runtime(batch),
-        "decode": lambda: decode(maps, 0, height, width, int8.settings),
+        "decode": lambda: decode(maps, 0, grey, int8.settings),
         "match": lambda: mutual_nearest_neighbours(before, features, 0.7),
         "frame, float32": lambda: mutual_nearest_neighbours(before, float32(image), 0.7),
         "frame, int8": lambda: mutual_nearest_neighbours(before, int8(image), 0.7),

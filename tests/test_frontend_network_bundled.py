@@ -108,7 +108,7 @@ def test_int8_finds_nearly_the_same(frontend, drawings):
     weights = frontend.weights
     if not weights.card.activation_ranges:
         pytest.skip("these weights are not calibrated for int8")
-    whole = dataclasses.replace(SETTINGS, subpixel_radius=0)
+    whole = dataclasses.replace(SETTINGS, subpixel_radius=0, corner_radius=0)
     exact, rounded = (
         NetworkFrontend(weights, dataclasses.replace(whole, precision=precision)) for precision in ("float32", "int8")
     )

@@ -7,6 +7,7 @@ import pytest
 
 from network_examples import brightness_weights, lit_pixel_weights, random_weights
 from sivo.errors import ConfigError, InputError
+from sivo.frontend.corners import refine_to_corners
 from sivo.frontend.decoding import find_keypoints, refine, sample_descriptors
 from sivo.frontend.network import NetworkFrontend
 from sivo.frontend.settings import NetworkSettings
@@ -17,7 +18,7 @@ SIZE = (101, 133)  # height, width: neither a multiple of 8
 
 @pytest.fixture(scope="module")
 def lit_pixels() -> NetworkFrontend:
-    return NetworkFrontend(lit_pixel_weights(), NetworkSettings(subpixel_radius=0))
+    return NetworkFrontend(lit_pixel_weights(), NetworkSettings(subpixel_radius=0, corner_radius=0))
 
 
 def image_of(pixels: np.ndarray, size: tuple[int, int] = SIZE) -> UInt8:
@@ -65,7 +66,7 @@ def test_keypoints_stay_out_of_the_border_and_of_the_padding(lit_pixels):
     outside = np.array([[3, 50], [100, 3], [width - 4, 70], [30, height - 4]])
     image = image_of(np.concatenate([inside, outside]))
     assert in_order(lit_pixels(image).keypoints) == in_order(inside)
-    everywhere = NetworkFrontend(lit_pixel_weights(), NetworkSettings(border=0, subpixel_radius=0))
+    everywhere = NetworkFrontend(lit_pixel_weights(), NetworkSettings(border=0, subpixel_radius=0, corner_radius=0))
     corner = np.array([[width - 1, height - 1]])  # repeated by the padding, which must not count
     assert in_order(everywhere(image_of(corner)).keypoints) == in_order(corner)
 
@@ -83,7 +84,7 @@ def test_stability_logits_are_interpolated_between_cell_centres():
 
 
 def test_stability_at_keypoints_is_the_dense_map_there():
-    frontend = NetworkFrontend(random_weights(), NetworkSettings(subpixel_radius=0))
+    frontend = NetworkFrontend(random_weights(), NetworkSettings(subpixel_radius=0, corner_radius=0))
     image = np.random.default_rng(1).integers(0, 256, (77, 90), np.uint8)
     features = frontend(image)
     dense = frontend.stability_map(image)
@@ -141,7 +142,7 @@ def test_nothing_found_gives_empty_features(lit_pixels):
 
 
 def test_colour_and_float_give_what_grey_uint8_gives():
-    frontend = NetworkFrontend(random_weights(), NetworkSettings(subpixel_radius=0))
+    frontend = NetworkFrontend(random_weights(), NetworkSettings(subpixel_radius=0, corner_radius=0))
     grey = np.random.default_rng(2).integers(0, 256, (64, 80), np.uint8)
     expected = frontend(grey)
     assert len(expected) > 10
@@ -174,3 +175,26 @@ def test_other_images_are_refused(lit_pixels, image, message):
 def test_impossible_settings_are_refused(setting):
     with pytest.raises(ConfigError, match=next(iter(setting))):
         NetworkSettings(**setting)
+
+
+def test_keypoints_move_to_the_corner_beside_them():
+    board = np.full((80, 100), 0.2, np.float32)
+    board[:40, :50] = board[40:, 50:] = 0.8  # the corner is between the pixels, at (49.5, 39.5)
+    near = np.array([[52.0, 37.0], [46.3, 42.4], [49.0, 40.0]], np.float32)
+    far = np.array([[20.0, 20.0], [70.0, 60.0], [0.0, 0.0], [99.0, 79.0]], np.float32)
+    moved = refine_to_corners(board, np.concatenate([near, far]), 5)
+    np.testing.assert_allclose(moved[:3], [[49.5, 39.5]] * 3, atol=0.01)
+    np.testing.assert_array_equal(moved[3:], far)  # nothing but plain ground there
+    np.testing.assert_array_equal(refine_to_corners(board, near, 1)[0], near[0])  # too far for this radius
+    assert refine_to_corners(board, np.zeros((0, 2), np.float32), 5).shape == (0, 2)
+
+
+def test_keypoints_that_meet_at_one_corner_are_one_feature():
+    image = np.full((64, 96), 50, np.uint8)
+    image[:40, :50] = image[40:, 50:] = 200
+    everywhere = {"subpixel_radius": 0, "nms_radius": 0, "threshold": 0.0, "max_keypoints": 10000}
+    moved = NetworkFrontend(lit_pixel_weights(), NetworkSettings(**everywhere))(image)
+    alone = NetworkFrontend(lit_pixel_weights(), NetworkSettings(**everywhere, corner_radius=0))(image)
+    places = np.round(moved.keypoints)
+    assert len(np.unique(places, axis=0)) == len(places)
+    assert len(alone) - 121 < len(moved) < len(alone) - 50  # the square of radius 5 about the corner has 121 pixels

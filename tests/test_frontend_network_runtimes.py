@@ -171,7 +171,7 @@ def test_exported_onnx_gives_the_same_features(tmp_path, normalisation, subpixel
     save_weights(tmp_path / "tiny.safetensors", weights.tensors, weights.card)
     options = ["--max-keypoints", "400", "--subpixel-radius", str(subpixel_radius), "--threshold", "0.01"]
     assert main(["export", "onnx", str(tmp_path / "tiny.safetensors"), "-o", str(tmp_path / "m.onnx"), *options]) == 0
-    settings = NetworkSettings(max_keypoints=400, subpixel_radius=subpixel_radius, threshold=0.01)
+    settings = NetworkSettings(max_keypoints=400, subpixel_radius=subpixel_radius, corner_radius=0, threshold=0.01)
     frontend = NetworkFrontend(weights, settings)
     session = runtime.InferenceSession(tmp_path / "m.onnx", providers=["CPUExecutionProvider"])
     names = [output.name for output in session.get_outputs()]
@@ -199,7 +199,9 @@ def test_exported_onnx_finds_lit_pixels(tmp_path):
     runtime = pytest.importorskip("onnxruntime")
     from sivo.frontend.onnx_export import export_onnx
 
-    export_onnx(lit_pixel_weights(), tmp_path / "m.onnx", NetworkSettings(max_keypoints=5, subpixel_radius=0))
+    export_onnx(
+        lit_pixel_weights(), tmp_path / "m.onnx", NetworkSettings(max_keypoints=5, subpixel_radius=0, corner_radius=0)
+    )
     session = runtime.InferenceSession(tmp_path / "m.onnx", providers=["CPUExecutionProvider"])
     image = np.zeros((1, 1, 37, 51), np.float32)
     image[0, 0, [7, 30], [13, 41]] = 1

@@ -32,8 +32,10 @@ def run(arguments: argparse.Namespace) -> None:
         nms_radius=arguments.nms_radius,
         border=arguments.border,
         subpixel_radius=arguments.subpixel_radius,
+        corner_radius=0,  # works on the image beside the network; not part of the file
     )
     if not arguments.output.parent.is_dir():
         raise OutputError(f"{arguments.output}: no folder {arguments.output.parent}; make it first")
     export_onnx(load_weights(find_weights(arguments.weights)), arguments.output, settings)
     print(f"{arguments.output}: image (batch, 1, height, width) in [0, 1] -> {settings.max_keypoints} keypoints")
+    print("without the move to the image's corners (`sivo.frontend.corners`), which the sivo command makes afterwards")

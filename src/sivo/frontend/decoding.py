@@ -16,20 +16,27 @@ from sivo.frontend.settings import NetworkSettings
 from sivo.types import Features, Float32, Int64
 
 
-def decode(maps: NetworkMaps, row: int, height: int, width: int, settings: NetworkSettings) -> Features:
+def decode(maps: NetworkMaps, row: int, image: Float32, settings: NetworkSettings) -> Features:
     """Features of image `row` of the batch, best score first.
 
     Args:
         maps: of images that were padded at the right and the bottom.
         row: position in the batch.
-        height, width: of the image before padding; keypoints are found only within.
+        image: (H, W) grey in [0, 1], before padding; keypoints are found only within.
     """
+    height, width = image.shape
     heat = maps.heat[row, :height, :width]
     pixels = find_keypoints(heat, settings)
     scores = heat[pixels[:, 1], pixels[:, 0]]
     keypoints = (
         refine(heat, pixels, settings.subpixel_radius) if settings.subpixel_radius else pixels.astype(np.float32)
     )
+    if settings.corner_radius:
+        from sivo.frontend.corners import refine_to_corners
+
+        keypoints = refine_to_corners(image, keypoints, settings.corner_radius)
+        kept = first_at_place(keypoints)
+        keypoints, scores = keypoints[kept], scores[kept]
     descriptors = sample_descriptors(maps.descriptors[row], keypoints)
     stability = None
     if maps.stability_logits is not None:
@@ -60,6 +67,12 @@ def refine(heat: Float32, pixels: Int64, radius: int) -> Float32:
     y, x = np.meshgrid(steps - radius, steps - radius, indexing="ij")
     moments = patches @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1).astype(np.float32)
     return np.asarray(pixels + moments[:, :2] / moments[:, 2:], np.float32)
+
+
+def first_at_place(keypoints: Float32) -> Int64:
+    """Rows, in order, of the first keypoint (N, 2) at every whole pixel: two may have moved to one corner."""
+    _, first = np.unique(np.round(keypoints).astype(np.int64), axis=0, return_index=True)
+    return np.sort(first)
 
 
 def sample_descriptors(cells: Float32, keypoints: Float32) -> Float32:

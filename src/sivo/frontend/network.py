@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sivo.errors import InputError
 from sivo.frontend.architecture import CELL
 from sivo.frontend.decoding import decode, stability_map
-from sivo.frontend.runtime import NetworkMaps, Runtime, open_runtime
+from sivo.frontend.runtime import Runtime, open_runtime
 from sivo.frontend.settings import NetworkSettings
 from sivo.frontend.weights import Weights, find_weights, load_weights
 from sivo.types import Features, Float32
@@ -60,7 +60,7 @@ class NetworkFrontend:
         Raises:
             InputError: an image of another shape or type, or with values that are not finite.
         """
-        return self._features(self._run([image]), 0, image)
+        return self.batch([image])[0]
 
     def batch(self, images: Sequence[Image]) -> list[Features]:
         """Features of images of one size, in one pass of the network; memory grows with their number."""
@@ -69,12 +69,14 @@ class NetworkFrontend:
         sizes = {image.shape[:2] for image in images}
         if len(sizes) > 1:
             raise InputError(f"a batch needs images of one size, these have {sorted(sizes)}; pass them one by one")
-        maps = self._run(images)
-        return [self._features(maps, row, image) for row, image in enumerate(images)]
+        prepared = _prepared(images)
+        maps = self._runtime(prepared)
+        height, width = images[0].shape[:2]
+        return [decode(maps, row, grey[0, :height, :width], self.settings) for row, grey in enumerate(prepared)]
 
     def heat_map(self, image: Image) -> Float32:
         """Probability (H, W) that a pixel is a keypoint, before non-maximum suppression."""
-        heat = self._run([image]).heat[0]
+        heat = self._runtime(_prepared([image])).heat[0]
         return heat[: image.shape[0], : image.shape[1]].copy()
 
     def stability_map(self, image: Image) -> Float32:
@@ -83,17 +85,15 @@ class NetworkFrontend:
         Raises:
             InputError: the weights have no stability head.
         """
-        logits = self._run([image]).stability_logits
+        logits = self._runtime(_prepared([image])).stability_logits
         if logits is None:
             raise InputError(f"{self.name}: these weights have no stability head; use weights that were adapted to VO")
         return stability_map(logits[0], *image.shape[:2])
 
-    def _features(self, maps: NetworkMaps, row: int, image: Image) -> Features:
-        height, width = image.shape[:2]
-        return decode(maps, row, height, width, self.settings)
 
-    def _run(self, images: Sequence[Image]) -> NetworkMaps:
-        return self._runtime(np.stack([prepare(image) for image in images])[:, None])
+def _prepared(images: Sequence[Image]) -> Float32:
+    """(B, 1, H, W) what the runtime is given."""
+    return np.stack([prepare(image) for image in images])[:, None]
 
 
 def prepare(image: Image) -> Float32:
