@@ -1,4 +1,4 @@
-"""A small self-improvement for tests: two fifths of a second of training stand in for hours of it.
+"""A small self-improvement for tests: changing the weights at random stands in for training.
 
 Run as a program, it does one run of the loop: `improvement_example.py OUT SECONDS SEQUENCE...`.
 """
@@ -19,7 +19,7 @@ from sivo.evaluation.settings import SurvivalSettings
 from sivo.files import make_output_folder, write_json
 from sivo.frontend.weights import load_weights, save_weights
 from sivo.improvement.improve import Improvement, improve
-from sivo.improvement.settings import ImproveSettings, JudgeSettings
+from sivo.improvement.settings import HeldBackSettings, ImproveSettings, JudgeSettings
 from sivo.labeling.settings import LabelSettings
 from sivo.odometry.run_settings import FrontendSettings
 from sivo.training.settings import OdometryTrainingSettings
@@ -27,8 +27,10 @@ from sivo.training.settings import OdometryTrainingSettings
 SETTINGS = ImproveSettings(
     frontend=FrontendSettings("superpoint-small", max_keypoints=250),
     labels=LabelSettings(min_observations=6),
+    held_back=HeldBackSettings(0.3),
     judge=JudgeSettings(SurvivalSettings(gaps=(4, 8), pairs=6, min_pairs=2), calibration_images=2),
 )
+NOISE = (1e-4, 0.5)  # of the first round, which changes next to nothing, and of the second, which spoils the weights
 
 
 class FakeTraining:
@@ -39,7 +41,7 @@ class FakeTraining:
         seconds: that a round takes.
     """
 
-    def __init__(self, noise: Sequence[float] = (1e-3,), seconds: float = 0.0) -> None:
+    def __init__(self, noise: Sequence[float] = NOISE, seconds: float = 0.0) -> None:
         self.noise, self.seconds = noise, seconds
         self.calls: list[dict[str, Any]] = []
 
@@ -61,7 +63,7 @@ class FakeTraining:
         rng, noise = np.random.default_rng(seed), self.noise[min(seed, len(self.noise) - 1)]
         weights = load_weights(start)
         tensors = {
-            name: (value * (1 + noise * rng.standard_normal(value.shape))).astype(np.float32)
+            name: (value * np.exp(noise * rng.standard_normal(value.shape))).astype(np.float32)
             for name, value in sorted(weights.tensors.items())
         }
         rows = [{"step": step, "loss": 1.0 / step} for step in (1, 2, 3)]
@@ -71,11 +73,11 @@ class FakeTraining:
         return rows[-1]
 
 
-def run(output: Path, sequences: Sequence[Path], train: FakeTraining, rounds: int = 1, **options: Any) -> Improvement:
+def run(output: Path, sequences: Sequence[Path], train: FakeTraining, rounds: int = 2, **options: Any) -> Improvement:
     """One run of the loop."""
     settings = options.pop("settings", SETTINGS)
     return improve(list(sequences), output, settings, rounds, train=train, **options)
 
 
 if __name__ == "__main__":
-    run(Path(sys.argv[1]), [Path(word) for word in sys.argv[3:]], FakeTraining(seconds=float(sys.argv[2])), rounds=2)
+    run(Path(sys.argv[1]), [Path(word) for word in sys.argv[3:]], FakeTraining(seconds=float(sys.argv[2])))

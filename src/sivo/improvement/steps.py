@@ -168,7 +168,7 @@ def _refuse_unwritten(records: list[SequenceRecord]) -> list[SequenceRecord]:
     signs = ("cannot be written", *map(os.strerror, (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)))
     for record in records:
         if record.state != DONE and any(sign in record.reason for sign in signs):
-            raise OutputError(f"{record.reason}; run again to go on from here")
+            raise OutputError(f"{record.reason.partition(';')[0]}; make room, and run again to go on from here")
     return records
 
 

@@ -95,7 +95,10 @@ class Workspace:
             except yaml.YAMLError:
                 raise InputError(f"{path}: is damaged; choose another output folder") from None
             difference = config.first_difference(before, values)
-            if difference:
+            if difference and not self.split.is_file():  # nothing has come of it yet
+                for folder in (self.survey, self.start.folder):
+                    shutil.rmtree(folder, ignore_errors=True)
+            elif difference:
                 raise ConfigError(
                     f"{self.folder}: was begun with {difference}; give the same again, or another output folder"
                 )

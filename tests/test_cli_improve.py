@@ -1,0 +1,123 @@
+"""`sivo improve` as a user meets it: what it says, and one line for what it cannot work with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from rendered_walk import write_walk
+
+from improvement_example import FakeTraining
+from sivo import config
+from sivo.cli.main import main
+from sivo.improvement.settings import ImproveSettings
+
+OPTIONS = [
+    *("--frontend", "superpoint-small", "--max-keypoints", "250", "--set", "labels.min_observations=6"),
+    *("--set", "judge.survival.gaps=[4,8]", "--set", "judge.survival.pairs=6", "--set", "judge.survival.min_pairs=2"),
+    *("--set", "held_back.share=0.3", "--set", "judge.calibration_images=2"),
+]
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_walk(tmp_path_factory.mktemp("walk") / "room", frames=40, seed=3)
+
+
+@pytest.fixture
+def training(monkeypatch: pytest.MonkeyPatch) -> FakeTraining:
+    """In place of the real training, which has a test of its own."""
+    fake = FakeTraining()
+    monkeypatch.setattr("sivo.improvement.improve._train_odometry", fake)
+    return fake
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    capsys.readouterr()
+    assert main(["improve", *map(str, words), *OPTIONS]) == 2
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert message.startswith("sivo: ")
+    return message
+
+
+def write_frames(folder: Path, pictures: list[Any], camera: Path) -> Path:
+    folder.mkdir()
+    for i, picture in enumerate(pictures):
+        cv2.imwrite(str(folder / f"{i:06d}.png"), picture)
+    (folder / "camera.yaml").write_text((camera / "camera.yaml").read_text())
+    return folder
+
+
+def test_improve_says_what_it_did_and_where_the_result_is(
+    walk: Path, training: FakeTraining, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    words = ["improve", str(walk), "-o", str(out), "--steps", "90", "--seed", "7", *OPTIONS]
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert "held back, never trained on: the last 12 of 40 frames of room" in text
+    assert "matches survive 4 / 8 frames" in text
+    assert "12 of 12 frames tracked" in text
+    assert f"weights in {out / 'weights.safetensors'}" in text
+    assert (out / "report.html").is_file()
+    assert [call["seed"] for call in training.calls] == [7]
+    settings = yaml.safe_load((out / "settings.yaml").read_text())
+    assert settings["training"]["optimiser"]["steps"] == 90
+    assert settings["training"]["optimiser"]["decay_steps"] == 30
+    assert settings["odometry"]["seed"] == 7
+    assert main(["run", str(walk), "-o", str(tmp_path / "run"), "--frontend", str(out / "weights.safetensors")]) == 0
+
+
+def test_what_shows_no_depth_is_explained(
+    walk: Path, training: FakeTraining, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = cv2.imread(str(walk / "000000.png"), cv2.IMREAD_GRAYSCALE)
+    still = write_frames(tmp_path / "still", [first] * 16, walk)
+    assert "nothing could be labelled; still: " in refused(capsys, still, "-o", tmp_path / "a")
+    K = np.array([[260, 0, 159.5], [0, 260, 119.5], [0, 0, 1]])
+    turned = []
+    for angle in np.radians(0.5) * np.arange(16):
+        cos, sin = np.cos(angle), np.sin(angle)
+        turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+        turned.append(
+            cv2.warpPerspective(first, K @ turn @ np.linalg.inv(K), (320, 240), borderMode=cv2.BORDER_REFLECT)
+        )
+    rotating = write_frames(tmp_path / "rotating", turned, walk)
+    message = refused(capsys, rotating, "-o", tmp_path / "b")
+    assert "nothing could be labelled; rotating: " in message
+    assert "parallax" in message
+    assert not training.calls
+
+
+def test_a_scene_cut_is_labelled_on_both_sides(
+    walk: Path, training: FakeTraining, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = write_walk(tmp_path / "other", frames=26, seed=5)
+    files = [*sorted(walk.glob("*.png"))[:26], *sorted(other.glob("*.png"))]
+    cut = write_frames(tmp_path / "cut", [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files], walk)
+    assert main(["improve", str(cut), "-o", str(tmp_path / "out"), *OPTIONS]) == 0
+    assert "stable" in capsys.readouterr().out
+
+
+def test_bad_arguments_are_one_line(
+    walk: Path, training: FakeTraining, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert "no such file" in refused(capsys, tmp_path / "missing", "-o", out)
+    assert "--rounds 0" in refused(capsys, walk, "-o", out, "--rounds", "0")
+    assert "held back" in refused(capsys, walk, "-o", out, "--evaluate", walk)
+    assert "did you mean" in refused(capsys, walk, "-o", out, "--set", "held_back.shar=0.2")
+    assert "given twice" in refused(capsys, walk, walk, "-o", out)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "file").touch()
+    assert "did not write" in refused(capsys, walk, "-o", tmp_path / "mine")
+
+
+def test_config_prints_settings_that_are_read_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["config", "improve"]) == 0
+    (tmp_path / "improve.yaml").write_text(capsys.readouterr().out)
+    assert config.load(ImproveSettings, tmp_path / "improve.yaml") == ImproveSettings()

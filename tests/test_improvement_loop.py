@@ -1,0 +1,306 @@
+"""The loop: what it trains on, what it keeps, and that nothing is lost when it is stopped."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rendered_walk import write_walk
+
+from improvement_example import SETTINGS, FakeTraining, run
+from sivo.errors import ConfigError, InputError, OutputError, SivoError
+from sivo.frontend.weights import load_weights
+from sivo.improvement.improve import Improvement
+from sivo.improvement.judgement import Judgement, gain_interval, is_better, read_judgement, rule
+from sivo.improvement.settings import ImproveSettings, JudgeSettings
+from sivo.improvement.telling import Telling
+from sivo.labeling.labelled import read_labels
+
+EXAMPLE = Path(__file__).with_name("improvement_example.py")
+LABEL_TABLES = ("tracks.parquet", "points.parquet", "frames.parquet", "trajectory.txt")
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of 40 frames."""
+    return write_walk(tmp_path_factory.mktemp("walk") / "room", frames=40, seed=3)
+
+
+@pytest.fixture(scope="module")
+def finished(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Improvement, FakeTraining, list[str]]:
+    """Two rounds on it: the first changes next to nothing, the second spoils the weights."""
+    training, lines = FakeTraining(), list[str]()
+    out = tmp_path_factory.mktemp("improve") / "out"
+    return run(out, [walk], training, telling=Telling(lines.append)), training, lines
+
+
+def starting(name: str) -> ImproveSettings:
+    """The settings with another frontend at the start."""
+    return replace(SETTINGS, frontend=replace(SETTINGS.frontend, name=name))
+
+
+def results(out: Path) -> dict[str, object]:
+    """All that the loop is for: labels and splits byte for byte, tensors, and what was measured but for seconds."""
+    found: dict[str, object] = {
+        str(path.relative_to(out)): path.read_bytes()
+        for path in sorted(out.rglob("*"))
+        if path.name in (*LABEL_TABLES, "split.json", "settings.yaml") and "training" not in path.parts
+    }
+    for path in sorted(out.rglob("weights.safetensors")):
+        for name, value in load_weights(path).tensors.items():
+            found[f"{path.relative_to(out)}:{name}"] = value.tobytes()
+    for path in sorted(out.rglob("judgement.json")):
+        found[str(path.relative_to(out))] = {**json.loads(path.read_text()), "seconds": {}, "failures": []}
+    return found
+
+
+def test_training_never_sees_what_is_held_back(finished: tuple[Improvement, FakeTraining, list[str]]) -> None:
+    result, training, _ = finished
+    assert len(training.calls) == 2
+    for call in training.calls:
+        (store,) = call["labels"]
+        (labelled,) = read_labels(store)
+        assert labelled.frames.index.tolist() == list(range(28))
+        assert labelled.settings.end == 28
+    for candidate in result.candidates[:2]:  # the last is too bad to track anything
+        (judged,) = read_labels(candidate.held_back)
+        assert judged.frames.index.tolist() == list(range(28, 40))
+
+
+def test_the_best_weights_are_kept_and_the_report_is_there(
+    finished: tuple[Improvement, FakeTraining, list[str]],
+) -> None:
+    result, training, lines = finished
+    scores = [judgement.score for judgement in result.judgements]
+    assert scores[2] < 0.8 * scores[0]
+    best = int(np.argmax(scores))
+    assert best == result.best < 2
+    kept, chosen = load_weights(result.weights), load_weights(result.candidates[best].weights)
+    for name, tensor in chosen.tensors.items():
+        np.testing.assert_array_equal(kept.tensors[name], tensor)
+    assert kept.card.metrics["improvement"]["kept"] == result.candidates[best].name
+    assert kept.card.activation_ranges == chosen.card.activation_ranges
+    assert all(load_weights(candidate.weights).card.activation_ranges for candidate in result.candidates)
+    # every round learns from the best before it, and the second try is another one
+    assert training.calls[1]["start"] == result.candidates[best].weights
+    assert [call["seed"] for call in training.calls] == [0, 1]
+    page = (result.weights.parent / "report.html").read_text()
+    assert rule(SETTINGS.judge) in page
+    assert "the last 12 of 40 frames of room" in page
+    assert page.count("data:image/png") >= 2
+    assert any(line.startswith("round 2: ") and line.endswith("not better, not kept") for line in lines)
+
+
+def test_no_better_round_leaves_the_start_and_says_so(walk: Path, tmp_path: Path) -> None:
+    result = run(tmp_path / "out", [walk], FakeTraining((0.5,)), rounds=1)
+    assert result.best == 0
+    kept, start = load_weights(result.weights), load_weights(result.candidates[0].weights)
+    assert all(np.array_equal(kept.tensors[name], tensor) for name, tensor in start.tensors.items())
+    assert "No round was better than the start" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_finished_run_is_left_as_it_is_and_more_rounds_go_on_from_it(
+    walk: Path, finished: tuple[Improvement, FakeTraining, list[str]]
+) -> None:
+    result, _, _ = finished
+    out = result.weights.parent
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file() and path.suffix != ".yaml"}
+    again = FakeTraining()
+    assert run(out, [walk], again, rounds=1).best == result.best  # fewer rounds do not undo the others
+    assert again.calls == []
+    changed = {path.name for path, when in before.items() if path.stat().st_mtime_ns != when}
+    assert changed <= {".sivo.json", "report.html"}
+
+
+def test_other_settings_recordings_or_weights_are_refused(
+    walk: Path, finished: tuple[Improvement, FakeTraining, list[str]], tmp_path: Path
+) -> None:
+    out = finished[0].weights.parent
+    training = replace(SETTINGS.training, descriptor_weight=2.0)
+    with pytest.raises(ConfigError, match=r"begun with training.descriptor_weight=1.0, now 2.0"):
+        run(out, [walk], FakeTraining(), settings=replace(SETTINGS, training=training))
+    with pytest.raises(ConfigError, match="frontend"):
+        run(out, [walk], FakeTraining(), settings=starting("superpoint"))
+    with pytest.raises(ConfigError, match="sequences"):
+        run(out, [tmp_path], FakeTraining())
+    with pytest.raises(ConfigError, match="has no weights to train"):
+        run(out, [walk], FakeTraining(), settings=starting("orb"))
+    free = replace(SETTINGS.training, optimiser=replace(SETTINGS.training.optimiser, threads=1, log_every=3))
+    run(out, [walk], FakeTraining(), settings=replace(SETTINGS, training=free))
+
+
+def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(walk: Path, tmp_path: Path) -> None:
+    good = [walk, write_walk(tmp_path / "hall", frames=30, seed=1)]
+    black, short, cut = tmp_path / "black", tmp_path / "short", tmp_path / "cut"
+    for folder, frames in ((black, 12), (short, 10), (cut, 24)):
+        folder.mkdir()
+        (folder / "camera.yaml").write_text((walk / "camera.yaml").read_text())
+        for i in range(frames):
+            source = good[i % 2 if folder is cut and i >= 12 else 0]
+            picture = cv2.imread(str(source / f"{i if folder is not cut else i % 12:06d}.png"), cv2.IMREAD_GRAYSCALE)
+            cv2.imwrite(str(folder / f"{i:06d}.png"), picture * (folder is not black))
+    (walk / "000004.png").rename(walk / "gone")
+    (walk / "000004.png").write_bytes(b"no picture")
+    try:
+        training, lines = FakeTraining(), list[str]()
+        sequences = [black, good[0], tmp_path / "missing", good[1]]
+        result = run(tmp_path / "out", sequences, training, rounds=1, telling=Telling(lines.append))
+    finally:
+        (walk / "gone").replace(walk / "000004.png")
+    text = "\n".join(lines)
+    assert "left out: black: " in text
+    assert "left out: missing: " in text
+    assert "held back, never trained on: hall" in text
+    (store,) = training.calls[0]["labels"]
+    (labelled,) = read_labels(store)
+    assert labelled.name == "room"
+    assert 4 not in labelled.frames.index  # unreadable
+    assert [found.name for found in read_labels(result.candidates[0].held_back)] == ["hall"]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Left out: black: " in page
+    # the labels of the survey are used, not made again
+    assert not list((tmp_path / "out" / "survey").glob("*/images-*"))
+    with pytest.raises(InputError, match="nothing could be labelled"):
+        run(tmp_path / "nothing", [black, short], FakeTraining())
+    few = replace(SETTINGS, sequence=replace(SETTINGS.sequence, end=5))
+    with pytest.raises(InputError, match="too few"):
+        run(tmp_path / "too-short", [short], FakeTraining(), settings=few)
+
+
+class StoppedError(Exception):
+    """Stands for a kill."""
+
+
+def test_a_run_that_ends_after_each_of_its_steps_goes_on(
+    walk: Path,
+    finished: tuple[Improvement, FakeTraining, list[str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from sivo.improvement.steps import Steps
+
+    made: list[str] = []
+
+    def stop_after(name: str) -> None:
+        step = getattr(Steps, name)
+
+        def stopping(steps: Steps, *arguments: object) -> object:
+            there = name != "label" and arguments[0].judgement.is_file()  # type: ignore[attr-defined]
+            done = step(steps, *arguments)
+            key = f"{name} {len(training.calls)} {arguments[0]}"
+            if key not in made and not there:
+                made.append(key)
+                raise StoppedError
+            return done
+
+        monkeypatch.setattr(Steps, name, stopping)
+
+    for name in ("label", "learn", "judge"):
+        stop_after(name)
+    training = FakeTraining()
+    stops = 0
+    while stops < 20:
+        try:
+            run(tmp_path / "out", [walk], training)
+            break
+        except StoppedError:
+            stops += 1
+    assert stops == len(made) >= 7  # three judgements, two rounds of labelling and learning
+    assert len(training.calls) == 2
+    assert results(tmp_path / "out") == results(finished[0].weights.parent)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
+def test_a_run_that_is_killed_at_random_moments_ends_the_same(
+    walk: Path, finished: tuple[Improvement, FakeTraining, list[str]], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(EXAMPLE), str(out), "1", str(walk)]
+    chance = random.Random(3)
+    killed = 0
+    for _ in range(3):
+        process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        deadline = time.monotonic() + 60
+        while not out.is_dir() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        time.sleep(chance.uniform(0.2, 5.0))
+        killed += process.poll() is None
+        process.kill()
+        process.wait()
+    assert killed
+    run(out, [walk], FakeTraining())
+    assert results(out) == results(finished[0].weights.parent)
+    assert not list(out.rglob("*.partial*"))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a limit on the size of files")
+def test_a_full_disk_is_one_line_and_the_run_goes_on_later(
+    walk: Path, finished: tuple[Improvement, FakeTraining, list[str]], tmp_path: Path
+) -> None:
+    import resource
+
+    before, done = resource.getrlimit(resource.RLIMIT_FSIZE), finished[0].weights.parent
+    for there in ([], ["start/weights.safetensors", "start/weights.json"]):  # the weights, then the labels do not fit
+        out = tmp_path / f"out-{len(there)}"
+        for name in (".sivo.json", "settings.yaml", "split.json", *there):
+            (out / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(done / name, out / name)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+        try:
+            with pytest.raises(SivoError, match=r"cannot be written \(.*File too large\)") as caught:
+                run(out, [walk], FakeTraining())
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert "\n" not in str(caught.value)
+    run(out, [walk], FakeTraining())
+    assert results(out) == results(finished[0].weights.parent)
+
+
+def judgement(agreeing: list[int], tracked: int = 100) -> Judgement:
+    return Judgement(100, tracked, 8.0, 0.8, 0.5, {}, {"30": agreeing}, {"30": 0.1})
+
+
+def test_better_is_more_matches_without_losing_frames() -> None:
+    settings = JudgeSettings()
+    start = judgement([40, 50, 60])
+    assert is_better(judgement([40, 50, 61]), start, settings)
+    assert not is_better(judgement([40, 50, 60]), start, settings)
+    assert is_better(judgement([80, 50, 60], tracked=99), start, settings)
+    assert not is_better(judgement([80, 50, 60], tracked=98), start, settings)
+    assert is_better(judgement([80, 50, 60], tracked=98), start, replace(settings, frames_lost=0.05))
+
+
+def test_the_interval_of_a_gain_is_over_pairs() -> None:
+    rng = np.random.default_rng(1)
+    before = rng.integers(20, 80, 50)
+    low, high = gain_interval(judgement((before + 5).tolist()), judgement(before.tolist()))
+    assert low == pytest.approx(5)
+    assert high == pytest.approx(5)
+    after = before + rng.normal(0, 20, 50).round().astype(int)
+    low, high = gain_interval(judgement(after.tolist()), judgement(before.tolist()))
+    assert low < 0 < high
+    assert high - low < 20
+
+
+def test_a_damaged_judgement_is_named(tmp_path: Path) -> None:
+    (tmp_path / "judgement.json").write_text("{")
+    with pytest.raises(InputError, match="measured again"):
+        read_judgement(tmp_path / "judgement.json")
+
+
+def test_a_folder_of_something_else_is_refused(walk: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("keep me")
+    with pytest.raises(OutputError, match="did not write"):
+        run(tmp_path, [walk], FakeTraining())

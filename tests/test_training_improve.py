@@ -1,0 +1,67 @@
+"""The loop with the real training, in six steps: nothing gets better, but all of it happens, and survives kills."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rendered_walk import write_walk
+
+from sivo.frontend.network import load_network_frontend
+from sivo.frontend.weights import load_weights
+
+COMMAND = [
+    *("--frontend", "superpoint-small", "--max-keypoints", "250", "--steps", "6", "--batch-size", "2"),
+    *("--set", "labels.min_observations=6", "--set", "judge.survival.gaps=[4,8]", "--set", "judge.survival.pairs=4"),
+    *("--set", "judge.survival.min_pairs=2", "--set", "held_back.share=0.3", "--set", "judge.calibration_images=2"),
+    *("--set", "training.optimiser.checkpoint_minutes=0", "--set", "training.optimiser.log_every=1"),
+    *("--set", "training.optimiser.workers=0", "--threads", "1"),
+]
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
+def test_a_round_is_the_same_after_kills(tmp_path: Path) -> None:
+    walk = write_walk(tmp_path / "room", frames=40, seed=3)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+
+    def start(out: Path) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "sivo", "improve", str(walk), "-o", str(out), *COMMAND]
+        return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    began = time.monotonic()
+    calm, killed = tmp_path / "calm", tmp_path / "killed"
+    assert start(calm).wait() == 0
+    whole = time.monotonic() - began
+    chance = random.Random(0)
+    kills = 0
+    for _ in range(2):
+        process = start(killed)
+        time.sleep(chance.uniform(0.2, 0.9) * whole)
+        kills += process.poll() is None
+        process.kill()
+        process.wait()
+    assert kills
+    assert start(killed).wait() == 0
+
+    trained = load_weights(calm / "round-1" / "weights.safetensors")
+    assert trained.architecture.stability
+    assert trained.card.activation_ranges
+    start_weights = load_weights(calm / "start" / "weights.safetensors")
+    assert any(not np.array_equal(trained.tensors[name], start_weights.tensors[name]) for name in start_weights.tensors)
+    for name in ("round-1/weights.safetensors", "weights.safetensors"):
+        ours, theirs = load_weights(killed / name), load_weights(calm / name)
+        assert ours.tensors.keys() == theirs.tensors.keys()
+        for key, tensor in ours.tensors.items():
+            np.testing.assert_array_equal(tensor, theirs.tensors[key])
+    for name in ("points.parquet", "tracks.parquet"):
+        path = Path("start", "labels", "room", name)
+        assert (killed / path).read_bytes() == (calm / path).read_bytes()
+    assert not list(killed.rglob("*.partial*"))
+    assert load_network_frontend(calm / "round-1" / "weights.safetensors").runtime.name == "openvino-int8"
