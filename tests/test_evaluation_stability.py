@@ -109,6 +109,7 @@ def test_the_command_finds_the_causes(simulation: Path, labels: Path, tmp_path: 
     assert rows["moving"]["recall"] == 1.0
     assert rows["moving"]["scores"]["label"]["roc_auc_followed"] == 1.0
     assert rows["moving"]["scores"]["median_error"]["roc_auc"] == 1.0
+    assert 2 <= rows["moving_left_its_place"]["labelled"] <= rows["moving"]["labelled"]
     assert rows["wrong_links"]["labelled"] == 1
     assert subject["static"]["unstable"] == 1
     assert subject["static"]["followed"]["unstable"] == 0

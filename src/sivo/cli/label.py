@@ -38,6 +38,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--relabel", action="store_true", help="where LABELS was made with other settings, label all of it anew"
     )
+    parser.add_argument(
+        "--max-stray",
+        type=float,
+        default=argparse.SUPPRESS,
+        metavar="SHARE",
+        help="end tracks where a link is farther than this share of the image width from the frame's median motion; "
+        "0.1 suits video of 10 frames a second and more (default: 0, never, as in the paper)",
+    )
     add_frontend_arguments(parser, defaults.frontend.name, defaults.frontend.max_keypoints)
     add_sequence_arguments(parser)
     add_config_arguments(parser)
@@ -45,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Label what is not labelled yet; 0 unless nothing could be."""
-    settings = settings_from(RunSettings, arguments, FRONTEND_FLAGS)
+    settings = settings_from(RunSettings, arguments, FRONTEND_FLAGS | {"max_stray": "odometry.matching.max_stray"})
     from tqdm import tqdm
 
     from sivo.improvement.labelling import label_sequences
@@ -93,4 +101,5 @@ def _line(record: object) -> str:
         return f"{record.name}: not labelled: {record.reason}"
     poses = f"{record.tracked} of {record.frames} frames with a pose"
     labels = f"{record.stable} stable, {record.unstable} unstable, {record.ignore} ignored tracks"
-    return f"{record.name}: {poses}; {labels}" + (f", {record.withheld} withheld" if record.withheld else "")
+    withheld = f", {record.withheld} withheld" if record.withheld else ""
+    return f"{record.name}: {poses}; {labels}{withheld}" + (f"; frames: {record.notes}" if record.notes else "")

@@ -3,7 +3,8 @@
 The positives are moving things and highlights (the headline), all causes together, and every cause by itself; the
 negatives are the points on static surfaces that nothing speaks against. Of tracks it is also known, from true poses and
 depth, which of those left their surface point: wrong links make a track unstable whatever it lies on. They are a row of
-their own, and every measure is given against all static points and against those that were followed.
+their own, and every measure is given against all static points and against those that were followed. In the same way
+the tracks on movers are told apart: a drawer that nobody pulls is as good as static, and only some `left_its_place`.
 
 The label is made from the mean and the largest error of a track. Two graded scores are those; the third is the median
 error, which one wrong link in a good track does not move, but a thing that moves does: it tells the place from the
@@ -27,7 +28,7 @@ from sivo.evaluation.true_errors import true_track_errors
 from sivo.types import Float32, Float64, Int64
 
 HEADLINE = ("moving", "highlight")
-STRAYED = 5.0  # pixels from its true place, at which a track on a static surface counts as wrongly linked
+STRAYED = 5.0  # pixels from where a static point would be, at which a track was wrongly linked, or its thing moved
 
 
 @dataclass(frozen=True)
@@ -168,6 +169,8 @@ def summarise(judged: Judged) -> dict[str, Any]:
         positive = np.isin(judged.cause, ranks)
         rows.append(_row(group, int(judged.total[ranks].sum()), positive, static, followed, judged))
     if np.isfinite(judged.true_error).any():
+        away = (judged.cause == PRECEDENCE.index("moving")) & (judged.true_error >= STRAYED)
+        rows.append(_row("moving_left_its_place", int(away.sum()), away, static, followed, judged))
         rows.append(_row("wrong_links", int(strayed.sum()), strayed, followed, followed, judged))
     return {
         "causes": rows,

@@ -137,11 +137,15 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
     )
     write_frames(job.folder / FRAMES_FILE, frames)
     if job.pack:
-        pack_images(job.folder, (frame.image for frame in sequence))
+        try:
+            pack_images(job.folder, (frame.image for frame in sequence))
+        except OSError as error:
+            raise OutputError(f"{job.folder}: the frames cannot be packed ({error}); choose another folder") from None
     return SequenceRecord(
         name=job.name,
         path=str(job.path),
         state=DONE,
+        notes=_notes(report, trust.counts()),
         format=sequence.format,
         frames=count,
         tracked=tracked,
@@ -195,6 +199,22 @@ def _fingerprint(settings: RunSettings, pack: bool) -> dict[str, Any]:
 def _last_reason(report: dict[str, Any]) -> str:
     events = report["events"]
     return events[-1]["detail"] if events else "too little motion or texture"
+
+
+def _notes(report: dict[str, Any], trust: dict[str, int]) -> str:
+    """What of a labelled sequence has no labels, and why, in one line."""
+    notes = []
+    if skipped := report["input"]["skipped"]:
+        notes.append(f"{len(skipped)} unreadable (first: frame {skipped[0]['index']}, {skipped[0]['reason']})")
+    if lost := report["frames"]["lost_frames"]:
+        why = {event["position"]: event["detail"] for event in report["events"]}
+        notes.append(f"{len(lost)} without a pose (first: frame {lost[0]}, {why.get(lost[0], _last_reason(report))})")
+    if len(report["segments"]) > 1:
+        starts = ", ".join(str(segment["first"]) for segment in report["segments"][1:])
+        notes.append(f"tracking began anew at frame {starts}")
+    reasons = {"high_error": "that fit badly", "little_parallax": "of little parallax", "contradicted": "in doubt"}
+    notes += [f"{trust[name]} {words}" for name, words in reasons.items() if trust[name]]
+    return "; ".join(notes)
 
 
 def _why_none(trust: dict[str, int], counts: dict[str, int]) -> str:

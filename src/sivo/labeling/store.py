@@ -41,6 +41,7 @@ class SequenceRecord:
     path: str  # of the recording, absolute
     state: str  # DONE or FAILED
     reason: str = ""  # why it failed
+    notes: str = ""  # what of it has no labels, and why
     format: str = ""
     frames: int = 0  # processed
     tracked: int = 0  # with a pose
