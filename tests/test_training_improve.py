@@ -8,14 +8,16 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rendered_walk import write_walk
 
+from sivo.cli.main import main
 from sivo.frontend.network import load_network_frontend
-from sivo.frontend.weights import load_weights
+from sivo.frontend.weights import load_weights, save_weights
 
 COMMAND = [
     *("--frontend", "superpoint-small", "--max-keypoints", "250", "--steps", "6", "--batch-size", "2"),
@@ -65,3 +67,37 @@ def test_a_round_is_the_same_after_kills(tmp_path: Path) -> None:
         assert (killed / path).read_bytes() == (calm / path).read_bytes()
     assert not list(killed.rglob("*.partial*"))
     assert load_network_frontend(calm / "round-1" / "weights.safetensors").runtime.name == "openvino-int8"
+
+
+def test_weights_that_a_kill_left_behind_their_checkpoint_are_written_again(tmp_path: Path) -> None:
+    command = ["train", "shapes", "-o", str(tmp_path), "--steps", "4", "--batch-size", "2", "--threads", "1"]
+    command += ["--set", "optimiser.workers=0", "--set", "optimiser.log_every=2", "--set", "views.height=48"]
+    assert main(command) == 0
+    weights = tmp_path / "weights.safetensors"
+    whole = load_weights(weights)
+    for old in (None, 2):  # never written, or of an earlier checkpoint
+        weights.unlink()
+        if old:
+            card = replace(whole.card, training={**whole.card.training, "steps": old})
+            save_weights(weights, {name: 0 * tensor for name, tensor in whole.tensors.items()}, card)
+        assert main(command) == 0
+        again = load_weights(weights)
+        assert again.card.training["steps"] == 4
+        assert all(np.array_equal(again.tensors[name], tensor) for name, tensor in whole.tensors.items())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a limit on the size of files")
+def test_a_checkpoint_that_finds_the_disk_full_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    try:
+        command = ["train", "shapes", "-o", str(tmp_path), "--steps", "1", "--batch-size", "1", "--threads", "1"]
+        assert main([*command, "--set", "optimiser.workers=0", "--set", "views.height=48"]) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert message.startswith("sivo: ")
+    assert "checkpoint.pt: cannot be written (is the disk full?" in message
+    assert not list(tmp_path.glob("*.partial*"))

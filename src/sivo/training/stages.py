@@ -159,7 +159,8 @@ def _run(
     files.make_output_folder(output, f"train {card.training['stage']}")
     _same_settings(output / SETTINGS, settings)
     trainer = Trainer(stage, batches, settings.optimiser, output)
-    if trainer.resume() and progress:
+    resumed = trainer.resume()
+    if resumed and progress:
         print(f"{output}: continues at step {trainer.step} of {settings.optimiser.steps}")
 
     def save(trainer: Trainer) -> None:
@@ -168,9 +169,16 @@ def _run(
         training = {**card.training, "steps": trainer.step, "seconds": round(trainer.seconds)}
         save_weights(output / WEIGHTS, tensors, replace(card, training=training, metrics=row))
 
+    if resumed and _saved_steps(output / WEIGHTS) != trainer.step:
+        save(trainer)  # killed between the checkpoint and these
     trainer.run(progress, on_checkpoint=save)
     last: dict[str, Any] = json.loads((output / "metrics.jsonl").read_text().splitlines()[-1])
     return last
+
+
+def _saved_steps(path: Path) -> int:
+    """The step that a weights file is of; -1 where there is none."""
+    return int(load_weights(path).card.training["steps"]) if path.is_file() else -1
 
 
 def _network(name: str, seed: int, start: Path | None) -> tuple[SuperPoint, str]:

@@ -132,7 +132,10 @@ class Trainer:
             "seconds": self.seconds,
         }
         with files.written_atomically(self.folder / CHECKPOINT) as temporary:
-            torch.save(state, temporary)
+            try:
+                torch.save(state, temporary)
+            except RuntimeError as error:  # what torch makes of a full disk
+                raise OSError(f"is the disk full? {str(error).splitlines()[0]}") from None
 
     def run(self, progress: bool = True, on_checkpoint: Any = None) -> nn.Module:
         """Train up to the last step; returns the averaged network.
