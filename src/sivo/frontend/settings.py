@@ -17,7 +17,7 @@ class NetworkSettings:
     """
 
     max_keypoints: int = 1000  # kept per image, best first
-    threshold: float = 0.005  # least probability of a keypoint
+    threshold: float = 0.0005  # least probability of a keypoint
     nms_radius: int = 4  # pixels: a keypoint is the best of the square of this radius around it
     border: int = 4  # pixels: no keypoints this close to the image's edge
     subpixel_radius: int = 4  # move to the centre of mass of the heat map within this radius; 0 leaves whole pixels
