@@ -17,6 +17,7 @@ import cv2
 from sivo.frontend.calibration import calibrate
 from sivo.frontend.weights import BUNDLED, load_weights, save_weights
 
+NO_HEAD = "The stability head is not part of these weights: only VO adaptation can teach it. "
 ATTRIBUTION = (
     "All frames were converted to greyscale, reduced and re-compressed. The authors of the data sets do not endorse "
     "this work. None of the pictures is of redkitchen, hololens-office, checkerboard-desk, kitti00 or fr3-notexture, "
@@ -51,7 +52,7 @@ def main() -> None:
     card = replace(
         weights.card,
         metrics={**training, **({"pose": poses} if poses else {})},
-        notes=f"The stability head is not part of these weights: only VO adaptation can teach it. {ATTRIBUTION}",
+        notes=f"{'' if weights.architecture.stability else NO_HEAD}{ATTRIBUTION}",
     )
     weights = replace(weights, card=card)
     if arguments.calibrate:
