@@ -1,16 +1,18 @@
-"""Kill `sivo label` and `sivo improve` (which trains) at random moments, start them again, and compare with a calm run.
+"""Kills `sivo improve`, which labels, trains and judges, at random moments (kill -9), and starts it again.
 
-    python benchmarks/kills.py --kills 10
+    python benchmarks/killed_improve.py [--kills 10] [--seed 0]
 
-Works on the bundled recording. Prints for each command how often it was killed where, and whether labels and weights
-are the same in the end and no half-written file is left.
+On the bundled recording. At the end the labels must be the bytes, and the weights the numbers, of a run that nobody
+disturbed, and no half-written file may be left.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -23,26 +25,23 @@ from sivo.frontend.weights import load_weights
 from sivo.simulation import bundled_sequence
 
 TABLES = ("tracks.parquet", "points.parquet", "frames.parquet", "trajectory.txt")
-COMMANDS = {
-    "label": ["--frontend", "superpoint-small"],
-    "improve": [
-        *("--frontend", "superpoint-small", "--steps", "20", "--batch-size", "2"),
-        *("--set", "held_back.share=0.4", "--set", "judge.survival.pairs=10", "--set", "judge.calibration_images=4"),
-        *("--set", "training.optimiser.checkpoint_minutes=0", "--set", "training.optimiser.log_every=1"),
-    ],
-}
+OPTIONS = [
+    *("--frontend", "superpoint-small", "--steps", "20", "--batch-size", "2"),
+    *("--set", "held_back.share=0.4", "--set", "judge.survival.pairs=10", "--set", "judge.calibration_images=4"),
+    *("--set", "training.optimiser.checkpoint_minutes=0", "--set", "training.optimiser.log_every=1"),
+]
 
 
-def start(command: str, out: Path) -> subprocess.Popen[bytes]:
-    """The command in a process of its own."""
-    words = [sys.executable, "-m", "sivo", command, str(bundled_sequence()), "-o", str(out), *COMMANDS[command]]
-    return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+def start(out: Path) -> subprocess.Popen[bytes]:
+    """The command in a process group of its own."""
+    words = [sys.executable, "-m", "sivo", "improve", str(bundled_sequence()), "-o", str(out), *OPTIONS]
+    return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
 
 
-def finish(command: str, out: Path) -> None:
+def finish(out: Path) -> None:
     """Run the command to its end."""
-    if start(command, out).wait():
-        raise SystemExit(f"sivo {command} failed in {out}")
+    if start(out).wait():
+        raise SystemExit(f"sivo improve failed in {out}")
 
 
 def contents(out: Path) -> dict[str, bytes]:
@@ -61,40 +60,43 @@ def newest(out: Path) -> str:
 
 
 def main() -> None:
-    """Print the result for both commands."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """One run in peace, then one that is killed again and again."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--command", choices=[*COMMANDS, "both"], default="both")
     arguments = parser.parse_args()
     chance = random.Random(arguments.seed)
-    for command in COMMANDS if arguments.command == "both" else [arguments.command]:
-        with tempfile.TemporaryDirectory() as folder:
-            calm, killed = Path(folder, "calm"), Path(folder, "killed")
-            began = time.monotonic()
-            finish(command, calm)
-            whole = time.monotonic() - began
-            print(f"sivo {command}: {whole:.0f} s undisturbed")
-            kills = 0
-            while kills < arguments.kills:
-                process = start(command, killed)
-                try:
-                    process.wait(chance.uniform(0.1, 0.8) * whole)
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
-                    kills += 1
-                    print(f"  kill {kills}: last written {newest(killed)}", flush=True)
-                else:  # it had come to its end: begin anew, so that every kill meets a run at work
-                    print("  came to its end; the next begins anew", flush=True)
-                    assert contents(killed) == contents(calm), "another result"
-                    shutil.rmtree(killed)
-            finish(command, killed)
-            same = contents(killed) == contents(calm)
-            left = [path.name for path in killed.rglob("*.partial*")]
-            print(f"  same labels and weights: {same} ({len(contents(calm))} compared); half-written files: {left}")
-            if not same or left:
-                raise SystemExit(1)
+    with tempfile.TemporaryDirectory() as folder:
+        calm, killed = Path(folder, "calm"), Path(folder, "killed")
+        began = time.monotonic()
+        finish(calm)
+        whole = time.monotonic() - began
+        print(f"undisturbed: {whole:.0f} s", flush=True)
+        kills = 0
+        while kills < arguments.kills:
+            process = start(killed)
+            try:
+                process.wait(chance.uniform(0.1, 0.6) * whole)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+                kills += 1
+                print(f"kill {kills}: last written {newest(killed)}", flush=True)
+            else:  # begin anew, so that every kill meets a run at work
+                print("came to its end", flush=True)
+                compare(calm, killed)
+                shutil.rmtree(killed)
+        finish(killed)
+        compare(calm, killed)
+
+
+def compare(calm: Path, killed: Path) -> None:
+    """Print whether both are the same; end with an error where they are not."""
+    ours, theirs = contents(killed), contents(calm)
+    left = [path.name for path in killed.rglob("*.partial*")]
+    print(f"same labels and weights: {ours == theirs} ({len(theirs)} compared); half-written files: {left}", flush=True)
+    if ours != theirs or left:
+        raise SystemExit(1)
 
 
 if __name__ == "__main__":

@@ -51,7 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SEQUENCE",
         help="held back to judge by (default: one sequence in five, or the last fifth of a single one)",
     )
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help="sequences labelled at a time")
+    parser.add_argument("--workers", type=int, metavar="N", help="sequences labelled at a time (default: 1)")
+    parser.add_argument("--ray", metavar="ADDRESS", help="a Ray cluster that labels them, as in `sivo label`")
     parser.add_argument(
         "--data-card", type=Path, metavar="FILE", help="JSON list of name, licence, attribution for the model card"
     )
@@ -94,6 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.rounds,
         arguments.evaluate,
         arguments.workers,
+        arguments.ray,
         data,
         Telling(lambda text: print(text, flush=True), progress=True),
     )

@@ -40,7 +40,8 @@ def improve(
     settings: ImproveSettings,
     rounds: int = 1,
     evaluate: Sequence[Path] = (),
-    workers: int = 1,
+    workers: int | None = None,
+    ray: str | None = None,
     data: tuple[DataSource, ...] = (),
     telling: Telling | None = None,
     train: Train | None = None,
@@ -53,7 +54,7 @@ def improve(
         settings: all of them; `settings.frontend.name` is where the loop starts.
         rounds: of labelling, training and judging.
         evaluate: recordings to hold back; without any, some of `sequences`, or the last part of a single one.
-        workers: sequences that are labelled at a time.
+        workers, ray: who labels many sequences, see `sivo.improvement.labelling.label_sequences`.
         data: what the model card says about the recordings.
         telling: shows progress and results.
         train: in place of `sivo.training.stages.train_odometry`.
@@ -66,7 +67,7 @@ def improve(
     telling = telling or Telling()
     first_weights = starting_weights(settings.frontend.name)
     workspace = Workspace(output, sequences, evaluate, settings, first_weights)
-    steps = Steps(workspace, settings, train or _train_odometry, data, workers, telling)
+    steps = Steps(workspace, settings, train or _train_odometry, data, workers, ray, telling)
 
     split = steps.hold_back(sequences, evaluate, first_weights)
     telling.split(split)

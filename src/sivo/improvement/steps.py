@@ -51,6 +51,7 @@ class Steps:
         train: what teaches.
         data: what the model card says about the recordings.
         workers: sequences that are labelled at a time.
+        ray: address of a Ray cluster that labels them, see `sivo.improvement.on_ray`.
         telling: shows progress and results.
     """
 
@@ -60,11 +61,12 @@ class Steps:
         settings: ImproveSettings,
         train: Train,
         data: tuple[DataSource, ...],
-        workers: int,
+        workers: int | None,
+        ray: str | None,
         telling: Telling,
     ) -> None:
         self._workspace, self._settings, self._train = workspace, settings, train
-        self._data, self._workers, self._telling = data, workers, telling
+        self._data, self._workers, self._ray, self._telling = data, workers, ray, telling
 
     def hold_back(self, sequences: Sequence[Path], evaluate: Sequence[Path], start: Path) -> Split:
         """What is trained on and what is held back; several sequences are labelled first, to know which are of use."""
@@ -146,6 +148,7 @@ class Steps:
                 store,
                 self._settings.run_settings(how, frontend),
                 workers=self._workers,
+                ray=self._ray,
                 on_record=lambda record: self._telling.record(what, record),
                 on_frames=tick,
             )
