@@ -1,0 +1,132 @@
+"""What `sivo label` says of recordings that cannot be labelled, or not all of them; the rest is finished."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rendered_walk import write_walk
+
+from sivo.cli.main import main
+from sivo.labeling.labelled import read_labels
+from sivo.labeling.store import DONE, SequenceRecord, read_records
+
+OPTIONS = ["--frontend", "orb", "--max-keypoints", "250", "--set", "labels.min_observations=6"]
+FRAMES = 26
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_walk(tmp_path_factory.mktemp("walks") / "good", frames=FRAMES)
+
+
+@pytest.fixture(scope="module")
+def records(good: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, SequenceRecord]:
+    """One store over recordings with one trouble each."""
+    folder = tmp_path_factory.mktemp("troubles")
+    other = write_walk(folder / "other", frames=FRAMES, seed=5)
+    images = [cv2.imread(str(good / f"{i:06d}.png"), cv2.IMREAD_GRAYSCALE) for i in range(FRAMES)]
+    cut = [cv2.imread(str(other / f"{i:06d}.png"), cv2.IMREAD_GRAYSCALE) for i in range(FRAMES)]
+    black = np.zeros_like(images[0])
+    rng = np.random.default_rng(0)
+    still = [np.clip(images[0] + rng.normal(0, 2, black.shape), 0, 255).astype(np.uint8) for _ in range(14)]
+    contents = {
+        "black-between": [*images[:16], black, black, black, *images[19:]],
+        "black-only": [black] * 12,
+        "cut": [*images, *cut],
+        "still": still,
+        "ten": images[:10],
+        "two": images[:2],
+        "torn": images,
+    }
+    paths = [_write(folder / name, frames, good) for name, frames in contents.items()]
+    torn = folder / "torn" / "000009.png"
+    torn.write_bytes(torn.read_bytes()[:2000])
+    store = folder / "labels"
+    assert main(["label", *map(str, paths), str(folder / "nowhere"), "-o", str(store), *OPTIONS]) == 0
+    return {record.name: record for record in read_records(store)}
+
+
+def _write(folder: Path, frames: list[np.ndarray], like: Path) -> Path:
+    folder.mkdir()
+    for i, image in enumerate(frames):
+        cv2.imwrite(str(folder / f"{i:06d}.png"), image)
+    shutil.copy(like / "camera.yaml", folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("black-only", "no frame got a pose"),
+        ("still", "too little parallax"),
+        ("two", "odometry needs at least 3"),
+        ("nowhere", "no such file"),
+    ],
+)
+def test_what_cannot_be_labelled_has_its_reason(records: dict[str, SequenceRecord], name: str, reason: str) -> None:
+    assert records[name].state != DONE
+    assert reason in records[name].reason
+    assert "\n" not in records[name].reason
+
+
+@pytest.mark.parametrize(
+    ("name", "note"),
+    [
+        ("black-between", "3 without a pose (first: frame 16,"),
+        ("cut", f"tracking began anew at frame {FRAMES}"),
+        ("torn", "1 unreadable (first: frame 9, the image is truncated)"),
+    ],
+)
+def test_what_can_is_labelled_and_the_rest_explained(records: dict[str, SequenceRecord], name: str, note: str) -> None:
+    assert records[name].state == DONE
+    assert records[name].stable > 5
+    assert note in records[name].notes
+
+
+def test_ten_frames_are_labelled_or_explained(records: dict[str, SequenceRecord]) -> None:
+    record = records["ten"]
+    assert record.stable + record.unstable > 0 if record.state == DONE else record.reason
+
+
+def test_pure_rotation_is_explained(good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image = cv2.imread(str(good / "000000.png"), cv2.IMREAD_GRAYSCALE)
+    K = np.array([[260.0, 0, 159.5], [0, 260.0, 119.5], [0, 0, 1]])
+    turned = []
+    for i in range(16):
+        rotation, _ = cv2.Rodrigues(np.array([0.0, 0.012 * i, 0.0]))
+        turned.append(cv2.warpPerspective(image, K @ rotation @ np.linalg.inv(K), (320, 240)))
+    folder = _write(tmp_path / "turned", turned, good)
+    assert main(["label", str(folder), "-o", str(tmp_path / "labels"), *OPTIONS]) == 2
+    assert "a rotation explains the motion" in capsys.readouterr().err
+
+
+def test_a_full_disk_fails_what_does_not_fit_and_finishes_the_rest(good: Path, tmp_path: Path) -> None:
+    """Files may not grow over a limit that only the longer recording exceeds."""
+    longer = write_walk(tmp_path / "longer", frames=2 * FRAMES)
+    store = tmp_path / "labels"
+    assert main(["label", str(good), "-o", str(store), *OPTIONS]) == 0
+    limit = (store / "good" / "tracks.parquet").stat().st_size * 5 // 4
+    shutil.rmtree(store)
+
+    run = subprocess.run(
+        [sys.executable, "-m", "sivo", "label", str(longer), str(good), "-o", str(store), *OPTIONS],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "NUMBA_DISABLE_JIT": "0"},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "longer: not labelled: " in run.stdout
+    assert "cannot be written" in run.stdout
+    assert "Traceback" not in run.stderr
+    assert [sequence.name for sequence in read_labels(store)] == ["good"]
+    assert not [path for path in store.rglob("*") if ".partial" in path.name]
