@@ -121,3 +121,43 @@ def test_packed_frames_come_back_in_any_order(tmp_path, monkeypatch):
         assert np.median(difference) <= 2
     with pytest.raises(InputError, match="--pack"):
         PackedImages(Path(tmp_path / "elsewhere"))
+
+
+def test_a_killed_run_leaves_no_temporary_file_and_no_doubt(tmp_path):
+    folder = tmp_path / "labels"
+    folder.mkdir()
+    (folder / "..sivo.json.123.partial.json").write_text("{")  # killed before the folder was marked as ours
+    store = LabelStore(folder, SETTINGS)
+    finish(store, "kitchen")
+    (folder / ".manifest.parquet.123.partial.parquet").write_text("PAR1")
+    store.fail(SequenceRecord("hall", "/recordings/hall", FAILED, reason="dark"))
+    (folder / ".kitchen.failed.json").write_text((folder / ".hall.failed.json").read_text().replace("hall", "kitchen"))
+    again = LabelStore(folder, SETTINGS)
+    assert not list(folder.glob("*.partial*"))
+    assert [(record.name, record.state) for record in again.records()] == [("hall", FAILED), ("kitchen", DONE)]
+
+
+def test_relabelling_never_leaves_half_a_sequence(tmp_path, monkeypatch):
+    folder = tmp_path / "labels"
+    finish(LabelStore(folder, SETTINGS), "kitchen")
+
+    def killed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sivo.labeling.store.make_output_folder", killed)
+    with pytest.raises(KeyboardInterrupt):
+        LabelStore(folder, {**SETTINGS, "seed": 1}, relabel=True)
+    monkeypatch.undo()
+    assert not LabelStore(folder, SETTINGS).is_done("kitchen")
+    assert not (folder / "kitchen").exists()
+
+
+def test_a_manifest_that_cannot_be_written_is_no_failure_of_a_sequence(tmp_path, monkeypatch):
+    store = LabelStore(tmp_path / "labels", SETTINGS)
+
+    def full(*_: object) -> None:
+        raise OutputError("no space")
+
+    monkeypatch.setattr(store, "write_manifest", full)
+    finish(store, "kitchen")
+    assert store.is_done("kitchen")
