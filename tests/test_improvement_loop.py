@@ -169,13 +169,40 @@ def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(wa
     assert [found.name for found in read_labels(result.candidates[0].held_back)] == ["hall"]
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Left out: black: " in page
-    # the labels of the survey are used, not made again
-    assert not list((tmp_path / "out" / "survey").glob("*/images-*"))
+    assert sum("room: " in line and "with a pose" in line for line in lines) == 2  # once in the survey, once by a link
+    assert not (tmp_path / "out" / "survey").exists()
     with pytest.raises(InputError, match="nothing could be labelled"):
         run(tmp_path / "nothing", [black, short], FakeTraining())
     few = replace(SETTINGS, sequence=replace(SETTINGS.sequence, end=5))
     with pytest.raises(InputError, match="too few"):
         run(tmp_path / "too-short", [short], FakeTraining(), settings=few)
+
+
+def test_weights_without_activation_ranges_get_them_from_frames_that_are_not_held_back(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sivo.frontend.weights import find_weights, save_weights
+    from sivo.improvement import steps
+    from sivo.improvement.workspace import Workspace
+
+    bundled = load_weights(find_weights("superpoint-small"))
+    mine = tmp_path / "mine.safetensors"
+    save_weights(mine, bundled.tensors, replace(bundled.card, activation_ranges={}))
+    seen: list[np.ndarray] = []
+    calibrate = steps.write_calibrated
+    monkeypatch.setattr(
+        steps,
+        "write_calibrated",
+        lambda source, target, images: (seen.extend(images), calibrate(source, target, images)),
+    )
+    workspace = Workspace(tmp_path / "out", [walk], [], starting(str(mine)), mine)
+    loop = steps.Steps(workspace, starting(str(mine)), FakeTraining(), (), None, None, Telling())
+    split = loop.hold_back([walk], [], mine)
+    candidate = loop.begin(mine, split.training)
+    assert load_weights(candidate.weights).card.activation_ranges
+    training = [cv2.imread(str(walk / f"{i:06d}.png"), cv2.IMREAD_GRAYSCALE) for i in range(28)]
+    assert len(seen) == 2
+    assert all(any(np.array_equal(image, frame) for frame in training) for image in seen)
 
 
 class StoppedError(Exception):

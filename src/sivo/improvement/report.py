@@ -54,8 +54,9 @@ def write_report(
         f"{settings.frontend.name}, improved on {names}; judged on what it never saw, {split.words}.",
         _measures(start, settings),
         rounds,
-        _notes(candidates, judgements, best, split, settings),
+        _notes(candidates, judgements, split, settings),
         best,
+        _verdict(candidates, judgements, best, settings),
     )
 
 
@@ -120,16 +121,22 @@ def _round(
     )
 
 
-def _notes(
-    candidates: Sequence[Candidate], judgements: Sequence[Judgement], best: int, split: Split, settings: ImproveSettings
-) -> list[str]:
-    start = judgements[0]
-    notes = [rule(settings.judge)]
+def _verdict(
+    candidates: Sequence[Candidate], judgements: Sequence[Judgement], best: int, settings: ImproveSettings
+) -> str:
+    words = rule(settings.judge)
     if best:
-        words = gain_words(judgements[best], start)
-        notes.append(f"Kept: {candidates[best].name}, {words} matches that survive against the start.")
-    elif len(candidates) > 1:
-        notes.append("No round was better than the start: the weights kept are those at the start, unchanged.")
+        gain = gain_words(judgements[best], judgements[0])
+        return f"{words} Kept: {candidates[best].name}; matches that survive against the start: {gain}."
+    if len(candidates) > 1:
+        return f"{words} No round was better than the start: the weights kept are those at the start, unchanged."
+    return words
+
+
+def _notes(
+    candidates: Sequence[Candidate], judgements: Sequence[Judgement], split: Split, settings: ImproveSettings
+) -> list[str]:
+    start, notes = judgements[0], list[str]()
     if start.gaps != settings.judge.survival.gaps:
         wanted = "/".join(map(str, settings.judge.survival.gaps))
         used = "/".join(map(str, start.gaps))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -77,7 +78,9 @@ class Steps:
                 return named(sequences, evaluate, how)
             return last_part(sequences[0], how, share) if len(sequences) == 1 else self._survey(sequences, start)
 
-        return remembered(self._workspace.split, choose)
+        split = remembered(self._workspace.split, choose)
+        shutil.rmtree(self._workspace.survey, ignore_errors=True)
+        return split
 
     def begin(self, start: Path, part: Part) -> Candidate:
         """The candidate at the start: weights as given; where int8 lacks their activation ranges, those are added."""

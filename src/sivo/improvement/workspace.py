@@ -58,7 +58,7 @@ class Workspace:
 
     @property
     def survey(self) -> Path:
-        """Label store of all sequences, while it is being found out which of them can be labelled."""
+        """Label store of all sequences, only while it is being found out which of them can be labelled."""
         return self.folder / "survey"
 
     @property

@@ -42,6 +42,7 @@ def write_improvement_page(
     rounds: Sequence[Round],
     notes: Sequence[str] = (),
     best: int = -1,
+    verdict: str = "",
 ) -> None:
     """Write the page.
 
@@ -53,6 +54,7 @@ def write_improvement_page(
         rounds: at least one; the first is the frontend before.
         notes: what the reader should know, in plain words.
         best: the round that is held against the first.
+        verdict: which round is kept, and why.
     """
     first, last = rounds[0], rounds[best]
     page = Page(title, lead)
@@ -63,6 +65,8 @@ def write_improvement_page(
             if measure.name in first.values and measure.name in last.values
         ]
     )
+    if verdict:
+        page.paragraph(verdict)
     page.heading("What to look out for")
     page.warnings([*notes, *_setbacks(measures, first, last)], "Nothing: every measure is at least as good as before.")
     page.heading("Before and after")
