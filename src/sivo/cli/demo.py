@@ -12,7 +12,7 @@ from pathlib import Path
 
 from sivo.errors import SivoError
 
-_STEPS = 250
+_STEPS = 400
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

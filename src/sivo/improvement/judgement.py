@@ -54,7 +54,7 @@ def rule(settings: JudgeSettings) -> str:
     return (
         "A frontend is better than the best one before it if more of its matches survive on the frames held back, "
         "summed over the gaps, and the odometry loses with it no more than "
-        f"{settings.frames_lost:.0%} of the frames that it tracked with the other."
+        f"{100 * settings.frames_lost:g} % of the frames that it tracked with the other."
     )
 
 

@@ -65,13 +65,14 @@ def _measures(start: Judgement, settings: ImproveSettings) -> list[Measure]:
     keypoints, pixels = settings.judge.survival.max_keypoints, settings.judge.survival.max_epipolar_error
     measures = [
         Measure(
-            "matches that survive, summed over the gaps",
+            _score_name(start),
             f"mutual nearest neighbours of {keypoints} keypoints that agree with one epipolar geometry of the known "
             f"camera within {pixels:g} pixels, mean over the pairs of frames held back",
             digits=1,
         )
     ]
-    measures += [Measure(f"matches that survive {gap} frames", "as above, of one gap", digits=1) for gap in gaps]
+    if len(gaps) > 1:
+        measures += [Measure(f"matches that survive {gap} frames", "as above, of one gap", digits=1) for gap in gaps]
     measures += [Measure(f"share of keypoints that survive {gap} frames", "as above, of all") for gap in gaps]
     measures += [
         Measure("frames tracked", "share of the frames held back that the odometry gave a pose to", digits=3),
@@ -85,8 +86,13 @@ def _measures(start: Judgement, settings: ImproveSettings) -> list[Measure]:
     return measures
 
 
+def _score_name(judgement: Judgement) -> str:
+    one = len(judgement.gaps) == 1
+    return f"matches that survive {judgement.gaps[0]} frames" if one else "matches that survive, summed over the gaps"
+
+
 def _values(judgement: Judgement) -> dict[str, float]:
-    values = {"matches that survive, summed over the gaps": judgement.score}
+    values = {_score_name(judgement): judgement.score}
     for gap in judgement.gaps:
         values[f"matches that survive {gap} frames"] = judgement.surviving(gap)
         values[f"share of keypoints that survive {gap} frames"] = judgement.share[str(gap)]
@@ -138,11 +144,11 @@ def _notes(
 ) -> list[str]:
     start, notes = judgements[0], list[str]()
     if start.gaps != settings.judge.survival.gaps:
-        wanted = "/".join(map(str, settings.judge.survival.gaps))
-        used = "/".join(map(str, start.gaps))
+        missing = " and ".join(str(gap) for gap in settings.judge.survival.gaps if gap not in start.gaps)
+        used = " and ".join(map(str, start.gaps))
         notes.append(
-            f"What is held back is too short for gaps of {wanted} frames: judged by {used}. Short gaps are easy; "
-            "judge by longer recordings before you believe a small gain."
+            f"What is held back is too short for pairs {missing} frames apart: judged by pairs {used} frames apart. "
+            "Short gaps are easy; judge by longer recordings before you believe a small gain."
         )
     notes += [f"Left out: {reason}" for reason in split.unusable]
     for candidate, judgement in zip(candidates, judgements, strict=True):
@@ -160,8 +166,8 @@ def _pictures(
     pictures = []
     for name, caption, draw in (
         ("matches.png", "matches of two frames held back", _draw_matches),
-        ("stability.png", "stability of keypoints of a frame held back", _draw_stability),
         ("labels.png", "labels of a frame held back", _draw_labels),
+        ("stability.png", "stability of a frame held back", _draw_stability),
     ):
         target = candidate.folder / "pictures" / name
         if not target.is_file():
