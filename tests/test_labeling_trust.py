@@ -58,6 +58,11 @@ def test_each_reason_is_found_where_it_is():
     assert np.flatnonzero(trust.high_error).tolist() == list(range(15))
     assert np.flatnonzero(trust.little_parallax).tolist() == list(range(15, 30))
     assert np.flatnonzero(trust.contradicted).tolist() == list(range(22, 41))
+    segment = np.where(np.arange(FRAMES) < 10, 0, 1)  # the map of 10 to 40 was contradicted, and started anew
+    again = judge_frames(tracks, points, has_pose, np.array([40]), LabelSettings(), segment)
+    assert np.flatnonzero(again.contradicted).tolist() == list(range(10, 41))
+    lost = np.where(np.arange(FRAMES) == 40, -1, segment)
+    assert judge_frames(tracks, points, has_pose, np.array([40]), LabelSettings(), lost).contradicted.sum() == 19
     assert np.flatnonzero(trust.no_pose).tolist() == list(range(55, 60))
     assert np.flatnonzero(trust.trusted).tolist() == list(range(41, 55))
 

@@ -118,7 +118,14 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
     points, tracks = read_points(job.folder / POINTS_FILE), read_tracks(job.folder / TRACKS_FILE)
     contradictions = [event["position"] for event in report["events"] if event["kind"] == "contradiction"]
     has_pose = summary.trajectory.valid
-    trust = judge_frames(tracks, points, has_pose, np.array(contradictions, np.int64), job.settings.labels)
+    trust = judge_frames(
+        tracks,
+        points,
+        has_pose,
+        np.array(contradictions, np.int64),
+        job.settings.labels,
+        summary.trajectory.segment,
+    )
     trusted = trust.trusted
     if job.settings.labels.second_opinion.enabled:
         points = withhold_labels(points, tracks, trusted, job.settings.labels)

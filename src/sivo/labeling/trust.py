@@ -42,13 +42,20 @@ class FrameTrust:
 
 
 def judge_frames(
-    tracks: TracksTable, points: PointsTable, has_pose: Mask, contradictions: Int64, settings: LabelSettings
+    tracks: TracksTable,
+    points: PointsTable,
+    has_pose: Mask,
+    contradictions: Int64,
+    settings: LabelSettings,
+    segment: Int64 | None = None,
 ) -> FrameTrust:
     """Judge every frame of a finished sequence.
 
     Args:
         has_pose: (F,) whether the odometry gave the frame a pose.
         contradictions: positions at which the odometry's own check contradicted its map.
+        segment: (F,) final segment of each frame, -1 without a pose. After a contradiction the odometry starts a map
+            anew over frames that have misled it once, so all from the segment's first frame on are doubted.
     """
     rule = settings.second_opinion
     frames = len(has_pose)
@@ -59,7 +66,10 @@ def judge_frames(
     parallax = _median_by(frame, points.parallax_deg[track_row[long_enough]].astype(np.float64), frames)
     contradicted = np.zeros(frames, np.bool_)
     for position in contradictions:
-        contradicted[max(position - rule.doubted_before_contradiction, 0) : position + 1] = True
+        first = max(position - rule.doubted_before_contradiction, 0)
+        if segment is not None and segment[position] >= 0:
+            first = min(first, int(np.argmax(segment == segment[position])))
+        contradicted[first : position + 1] = True
     return FrameTrust(
         no_pose=~np.asarray(has_pose, np.bool_),
         high_error=error > rule.max_median_error,
