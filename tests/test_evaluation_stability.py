@@ -19,6 +19,7 @@ from sivo.geometry.se3 import inverse, rigid, transform
 from sivo.labeling.stability import label_stability
 from sivo.labeling.tables import PointsWriter, TracksWriter
 from sivo.sequences.tum_rgbd import TumRgbdWriter
+from sivo.simulation import bundled_sequence
 from sivo.types import Tracks
 
 CODES = {"static": 0, "moving": 1, "highlight": 2, "shadow_edge": 3, "depth_discontinuity": 4, "repeated_texture": 5}
@@ -117,6 +118,20 @@ def test_the_command_finds_the_causes(simulation: Path, labels: Path, tmp_path: 
     assert rows["highlight"]["scores"]["label"]["roc_auc"] is None
     assert (out / "stability.png").stat().st_size > 5000
     assert "| moving |" in (out / "stability.md").read_text()
+
+
+def test_labels_of_the_bundled_recording_find_what_moves(tmp_path: Path) -> None:
+    """The whole way from pictures: odometry, labels, true causes."""
+    out = tmp_path / "out"
+    assert main(["label", str(bundled_sequence()), "-o", str(tmp_path / "labels")]) == 0
+    assert main(["evaluate", "stability", str(tmp_path / "labels"), str(bundled_sequence()), "-o", str(out)]) == 0
+    subject = json.loads((out / "stability.json").read_text())["subjects"][0]
+    rows = {row["cause"]: row for row in subject["causes"]}
+    assert rows["moving"]["labelled"] > 30
+    assert subject["static"]["labelled"] > 300
+    assert rows["moving_or_highlight"]["scores"]["median_error"]["roc_auc"] > 0.88  # measured: 0.918
+    assert rows["moving_or_highlight"]["scores"]["label"]["roc_auc_followed"] > 0.94  # 0.978
+    assert subject["static"]["followed"]["false_alarms"] < 0.03  # 0
 
 
 def test_true_errors_tell_links_that_slid_from_wrong_poses() -> None:
