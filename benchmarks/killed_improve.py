@@ -83,7 +83,7 @@ def main() -> None:
                 kills += 1
                 print(f"kill {kills}: last written {newest(killed)}", flush=True)
             else:  # begin anew, so that every kill meets a run at work
-                print("came to its end", flush=True)
+                print(f"came to its end with status {process.returncode}", flush=True)
                 compare(calm, killed)
                 shutil.rmtree(killed)
         finish(killed)

@@ -123,7 +123,7 @@ def test_a_finished_run_is_left_as_it_is_and_more_rounds_go_on_from_it(
     assert changed <= {".sivo.json", "report.html"}
 
 
-def test_other_settings_recordings_or_weights_are_refused(
+def test_other_settings_are_refused_and_what_a_kill_left_is_cleared_away(
     walk: Path, finished: tuple[Improvement, FakeTraining, list[str]], tmp_path: Path
 ) -> None:
     out = finished[0].weights.parent
@@ -136,8 +136,14 @@ def test_other_settings_recordings_or_weights_are_refused(
         run(out, [tmp_path], FakeTraining())
     with pytest.raises(ConfigError, match="has no weights to train"):
         run(out, [walk], FakeTraining(), settings=starting("orb"))
+    leftovers = [out / "round-1" / "held-back" / ".room.partial" / ".points.parquet.1.partial.parquet"]
+    leftovers += [leftovers[0].with_name("frames.parquet"), out / ".weights.safetensors.1.partial.safetensors"]
+    leftovers[0].parent.mkdir()
+    for leftover in leftovers:
+        leftover.touch()
     free = replace(SETTINGS.training, optimiser=replace(SETTINGS.training.optimiser, threads=1, log_every=3))
     run(out, [walk], FakeTraining(), settings=replace(SETTINGS, training=free))
+    assert not any(leftover.exists() for leftover in leftovers)
 
 
 def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(walk: Path, tmp_path: Path) -> None:

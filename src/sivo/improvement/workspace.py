@@ -104,7 +104,7 @@ class Workspace:
                 )
         make_output_folder(self.folder, COMMAND)
         write_text(path, yaml.safe_dump(values, sort_keys=False))
-        for leftover in self.folder.rglob(".*.partial*"):  # of a killed run
+        for leftover in list(self.folder.rglob(".*.partial*")):  # of a killed run; some lie in others
             if leftover.is_dir():
                 shutil.rmtree(leftover, ignore_errors=True)
             else:
