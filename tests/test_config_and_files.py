@@ -32,6 +32,14 @@ def test_defaults_then_file_then_overrides(tmp_path: Path) -> None:
     assert settings == Outer(5, "home", Inner(4.0, ("x", "y")))
 
 
+def test_a_section_given_in_part_keeps_the_defaults_of_its_place() -> None:
+    @dataclass(frozen=True)
+    class Special:
+        inner: Inner = field(default_factory=lambda: Inner(width=9.0))
+
+    assert config.load(Special, None, ["inner.names=[z]"]) == Special(Inner(9.0, ("z",)))
+
+
 def test_what_is_printed_is_read_back(tmp_path: Path) -> None:
     path = tmp_path / "settings.yaml"
     settings = Outer(7, "there", Inner(0.25, ("p", "q")))

@@ -77,6 +77,9 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings") -> 
     from cattrs.errors import ClassValidationError
 
     _refuse_unknown_keys(cls, values, where, prefix="")
+    if all(_has_default(field) for field in dataclasses.fields(cls)):  # type: ignore[arg-type]
+        # a section given in part keeps the rest of what this class has for it, which may not be the section's own default
+        values = _over(to_dict(cls()), values)
     converter = cattrs.Converter(forbid_extra_keys=True)
     converter.register_structure_hook(bool, _strict(bool))
     converter.register_structure_hook(int, _strict(int))
@@ -99,6 +102,19 @@ def first_difference(before: Any, now: Any, prefix: str = "") -> str:
         if difference:
             return difference
     return ""
+
+
+def _has_default(field: dataclasses.Field[Any]) -> bool:
+    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
+
+
+def _over(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """Nested dictionaries: the values, and the defaults where there is none."""
+    result = dict(defaults)
+    for key, value in values.items():
+        below = result.get(key)
+        result[key] = _over(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+    return result
 
 
 def _strict(kind: type) -> Any:
