@@ -78,7 +78,7 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings") -> 
 
     _refuse_unknown_keys(cls, values, where, prefix="")
     if all(_has_default(field) for field in dataclasses.fields(cls)):  # type: ignore[arg-type]
-        # a section given in part keeps the rest of what this class has for it, which may not be the section's own default
+        # a section given in part keeps what this class has for the rest of it, not the section's own defaults
         values = _over(to_dict(cls()), values)
     converter = cattrs.Converter(forbid_extra_keys=True)
     converter.register_structure_hook(bool, _strict(bool))
