@@ -13,7 +13,6 @@ from pathlib import Path
 from sivo.cli.options import (
     FRONTEND_FLAGS,
     add_config_arguments,
-    add_frontend_arguments,
     add_sequence_arguments,
     settings_from,
 )
@@ -56,6 +55,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--data-card", type=Path, metavar="FILE", help="JSON list of name, licence, attribution for the model card"
     )
+    parser.add_argument(
+        "--frontend",
+        default=absent,
+        metavar="NAME",
+        help=f"network to begin with: a bundled one, or a .safetensors file (default: {defaults.frontend.name})",
+    )
+    parser.add_argument(
+        "--max-keypoints",
+        type=int,
+        default=absent,
+        metavar="N",
+        help=f"per frame (default: {defaults.frontend.max_keypoints})",
+    )
+    parser.add_argument("--seed", type=int, default=absent, help="of all random choices (default: 0)")
     group = parser.add_argument_group("training")
     group.add_argument(
         "--steps",
@@ -66,7 +79,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--batch-size", type=int, default=absent, metavar="N", help=f"(default: {optimiser.batch_size})")
     group.add_argument("--device", default=absent, help="cpu, cuda or auto (default: auto)")
     group.add_argument("--threads", type=int, default=absent, help="of torch on the CPU (default: its own choice)")
-    add_frontend_arguments(parser, defaults.frontend.name, defaults.frontend.max_keypoints)
     add_sequence_arguments(parser)
     add_config_arguments(parser)
 
