@@ -31,7 +31,9 @@ def camera_x(frame: int) -> float:
     return 0.03 * frame
 
 
-def write_labelled_scene(folder: Path, name: str = "walls", keypoint_noise: float = 0.0) -> Path:
+def write_labelled_scene(
+    folder: Path, name: str = "walls", keypoint_noise: float = 0.0, unstable_error: float = 4.0
+) -> Path:
     """A label store with one finished, packed sequence of `FRAMES` frames; returns the store."""
     rng = np.random.default_rng(0)
     xyz = scene_points()
@@ -59,7 +61,8 @@ def write_labelled_scene(folder: Path, name: str = "walls", keypoint_noise: floa
     with TracksWriter(partial / TRACKS_FILE) as writer:
         places = table[:, 2:] + keypoint_noise * rng.uniform(-1, 1, (len(table), 2))
         ones = np.ones(len(table))
-        writer.write(table[:, 0].astype(int), table[:, 1].astype(int), places, ones, 0 * ones)
+        errors = np.where(unstable[table[:, 1].astype(int)], unstable_error, 0.5)
+        writer.write(table[:, 0].astype(int), table[:, 1].astype(int), places, ones, errors)
     with PointsWriter(partial / POINTS_FILE) as writer:
         writer.write(
             PointsTable(

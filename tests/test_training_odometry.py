@@ -43,7 +43,7 @@ from sivo.training.stages import loaded  # noqa: E402
 from sivo.training.tracked_pairs import TrackedPairs  # noqa: E402
 
 TINY = Architecture("tiny", encoder=(4, 4, 4, 4, 8, 8, 8, 8), head=8, descriptor=8, stability=False)
-PAPER = LandmarkSettings(shared=False, unseen=False, reprojected=False)
+PAPER = LandmarkSettings(shared=False, unseen=False, reprojected=False, unstable_median_error=0.0)
 TRACKS_ONLY = LandmarkSettings(unseen=False, reprojected=False)
 LATE = HALF + 20  # a frame in which no track follows the odd far points any more
 
@@ -113,6 +113,13 @@ def test_stable_points_lie_at_their_projections(tmp_path: Path) -> None:
     stable = at_keypoint.stability == STABLE
     assert np.median(distances(at_keypoint.points[stable], exact)) > 0.2
     assert distances(at_projection.points[at_projection.stability == STABLE], exact).max() < 1e-3
+
+
+def test_an_unstable_label_of_one_wrong_link_does_not_teach(tmp_path: Path) -> None:
+    jumps = write_labelled_scene(tmp_path / "jumps", unstable_error=0.6)  # the median of the errors, not their largest
+    published, sure = (frames_of(jumps, s).points(5).stability for s in (PAPER, LandmarkSettings(unseen=False)))
+    assert (published == UNSTABLE).sum() > 20
+    assert not (sure == UNSTABLE).any()
 
 
 def settings_of(**changes: Any) -> OdometryTrainingSettings:

@@ -16,6 +16,13 @@ from sivo.cli.train_options import OPTIMISER_FLAGS, add_training_arguments, need
 from sivo.files import check_output_folder
 from sivo.training.settings import OdometryTrainingSettings
 
+PAPER = [
+    "landmarks.shared=false",
+    "landmarks.unseen=false",
+    "landmarks.reprojected=false",
+    "landmarks.unstable_median_error=0",
+]
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `sivo train odometry`."""
@@ -27,9 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--data-card", type=Path, metavar="FILE", help="JSON list of name, licence, attribution for the model card"
     )
     parser.add_argument(
-        "--only-tracks",
+        "--paper",
         action="store_true",
-        help="the paper's correspondences: points only where a track saw them, at its keypoints",
+        help="teach what the paper does: each track by itself, only where it was seen, and every unstable label",
     )
     add_training_arguments(parser, defaults.optimiser, parent="superpoint")
 
@@ -37,11 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Train and print where the weights are."""
     flags = {name: setting for name, setting in OPTIMISER_FLAGS.items() if name != "architecture"}
-    paper = (
-        ["landmarks.shared=false", "landmarks.unseen=false", "landmarks.reprojected=false"]
-        if arguments.only_tracks
-        else []
-    )
+    paper = PAPER if arguments.paper else []
     settings = settings_from(OdometryTrainingSettings, arguments, flags, paper)
     check_output_folder(arguments.output, "train odometry")
     data = read_data_card(arguments.data_card) if arguments.data_card else ()

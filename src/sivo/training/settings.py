@@ -120,6 +120,9 @@ class LandmarkSettings:
     shared: bool = True  # the tracks of one map point are judged together; False is the paper: each for itself
     unseen: bool = True  # stable points are also known where only their projection shows them; False is the paper
     reprojected: bool = True  # a stable point lies at its projection, not at the keypoint; False is the paper
+    # pixels; an unstable track whose median error is smaller has a wrong link or two, which say nothing on the place it
+    # shows, and is not taught as unstable; 0 is the paper
+    unstable_median_error: float = 2.0
     largest_correction: float = 2.0  # pixels of the recording between the two; beyond it the keypoint holds
     largest_view_angle_degrees: float = 40.0  # from the mean direction in which an unseen point was seen
     largest_distance_ratio: float = 1.7  # to its mean distance, in either direction
@@ -147,7 +150,7 @@ class OdometryTrainingSettings:
 
     longer_side: int = 320  # pixels; larger frames are reduced on loading
     descriptor_weight: float = 1.0
-    stability_weight: float = 0.3
+    stability_weight: float = 1.0
     masked_pixels: float = 8.0  # points nearer than this are not each other's negatives
     detector: DetectorLossSettings = field(default_factory=DetectorLossSettings)
     pairs: PairSettings = field(default_factory=PairSettings)
