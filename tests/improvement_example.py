@@ -17,27 +17,28 @@ import numpy as np
 
 from sivo.evaluation.settings import SurvivalSettings
 from sivo.files import make_output_folder, write_json
-from sivo.frontend.weights import load_weights, save_weights
+from sivo.frontend.weights import Weights, find_weights, load_weights, save_weights
 from sivo.improvement.improve import Improvement, improve
 from sivo.improvement.settings import HeldBackSettings, ImproveSettings, JudgeSettings
 from sivo.labeling.settings import LabelSettings
 from sivo.odometry.run_settings import FrontendSettings
 from sivo.training.settings import OdometryTrainingSettings
 
+SPOILED = "spoiled"  # stands for bundled weights with so much noise that a sixth of the matches is lost
 SETTINGS = ImproveSettings(
-    frontend=FrontendSettings("superpoint-small", max_keypoints=250),
+    frontend=FrontendSettings(SPOILED, max_keypoints=250),
     labels=LabelSettings(min_observations=6),
     held_back=HeldBackSettings(0.3),
-    judge=JudgeSettings(SurvivalSettings(gaps=(4, 8), pairs=6, min_pairs=2), calibration_images=2),
+    judge=JudgeSettings(SurvivalSettings(gaps=(4, 8), pairs=6, min_pairs=2, max_keypoints=250), calibration_images=2),
 )
-NOISE = (1e-4, 0.5)  # of the first round, which changes next to nothing, and of the second, which spoils the weights
+NOISE = (0.0, 0.5)  # of the first round, which gives the bundled weights back, and of the second, which ruins them
 
 
 class FakeTraining:
-    """Changes the weights a little, as told; what it was given is kept.
+    """Gives bundled weights with noise, as told; what it was given is kept.
 
     Args:
-        noise: relative change of all weights, one number a round; 0 leaves them as they are.
+        noise: relative change of all weights, one number a round.
         seconds: that a round takes.
     """
 
@@ -60,22 +61,31 @@ class FakeTraining:
             time.sleep(self.seconds / 20)
             write_json(output / "checkpoint.json", part)
         seed = settings.optimiser.seed
-        rng, noise = np.random.default_rng(seed), self.noise[min(seed, len(self.noise) - 1)]
-        weights = load_weights(start)
-        tensors = {
-            name: (value * np.exp(noise * rng.standard_normal(value.shape))).astype(np.float32)
-            for name, value in sorted(weights.tensors.items())
-        }
+        weights = noisy(self.noise[min(seed, len(self.noise) - 1)], seed)
         rows = [{"step": step, "loss": 1.0 / step} for step in (1, 2, 3)]
         (output / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
         card = replace(weights.card, activation_ranges={}, training={"stage": "odometry", "seconds": 1})
-        save_weights(output / "weights.safetensors", tensors, card)
+        save_weights(output / "weights.safetensors", weights.tensors, card)
         return rows[-1]
+
+
+def noisy(noise: float, seed: int) -> Weights:
+    """The weights of `superpoint-small` with relative noise."""
+    weights, rng = load_weights(find_weights("superpoint-small")), np.random.default_rng(seed)
+    tensors = {
+        name: (value * np.exp(noise * rng.standard_normal(value.shape))).astype(np.float32)
+        for name, value in sorted(weights.tensors.items())
+    }
+    return replace(weights, tensors=tensors)
 
 
 def run(output: Path, sequences: Sequence[Path], train: FakeTraining, rounds: int = 2, **options: Any) -> Improvement:
     """One run of the loop."""
     settings = options.pop("settings", SETTINGS)
+    if settings.frontend.name == SPOILED:
+        weights, path = noisy(0.3, 5), output.with_name("spoiled.safetensors")
+        save_weights(path, weights.tensors, weights.card)
+        settings = replace(settings, frontend=replace(settings.frontend, name=str(path)))
     return improve(list(sequences), output, settings, rounds, train=train, **options)
 
 

@@ -53,7 +53,7 @@ def rule(settings: JudgeSettings) -> str:
     """The decision rule, in a sentence."""
     return (
         "A frontend is better than the best one before it if more of its matches survive on the frames held back, "
-        "summed over the gaps, and the odometry loses with it no more than "
+        "summed over the gaps, by more than chance (95 % interval), and the odometry loses with it no more than "
         f"{100 * settings.frames_lost:g} % of the frames that it tracked with the other."
     )
 
@@ -61,18 +61,18 @@ def rule(settings: JudgeSettings) -> str:
 def is_better(candidate: Judgement, best: Judgement, settings: JudgeSettings) -> bool:
     """The rule."""
     kept = candidate.tracked >= (1 - settings.frames_lost) * best.tracked
-    return kept and candidate.score > best.score
+    return kept and gain_interval(candidate, best)[0] > 0
 
 
-def gain_interval(candidate: Judgement, start: Judgement, seed: int = 0) -> tuple[float, float]:
+def gain_interval(candidate: Judgement, before: Judgement, seed: int = 0) -> tuple[float, float]:
     """95 % interval of the gain in score, over paired resamples of the pairs, gap by gap."""
     gain = spread = 0.0
-    for gap in start.gaps:
-        before, after = (np.array(j.agreeing[str(gap)], np.float64) for j in (start, candidate))
-        if len(before) == 0:
+    for gap in before.gaps:
+        gains = np.array(candidate.agreeing[str(gap)]) - np.array(before.agreeing[str(gap)])
+        if len(gains) == 0:
             continue
-        mean = float((after - before).mean())
-        lower, upper = Bootstrap(len(before), seed, _RESAMPLES, _CONFIDENCE).interval(after - before)
+        mean = float(gains.mean())
+        lower, upper = Bootstrap(len(gains), seed, _RESAMPLES, _CONFIDENCE).interval(gains)
         gain += mean
         spread += max(upper - mean, mean - lower)  # the gaps share frames: taken as fully dependent
     return gain - spread, gain + spread

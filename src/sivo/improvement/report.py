@@ -51,7 +51,7 @@ def write_report(
     write_improvement_page(
         path,
         "A frontend that teaches itself",
-        f"{settings.frontend.name}, improved on {names}; judged on what it never saw, {split.words}.",
+        f"{Path(settings.frontend.name).name}, improved on {names}; judged on what it never saw, {split.words}.",
         _measures(start, settings),
         rounds,
         _notes(candidates, judgements, split, settings),
