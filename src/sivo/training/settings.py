@@ -149,6 +149,7 @@ class OdometryTrainingSettings:
     """`sivo train odometry`: VO adaptation, from label stores (paper, "Training Details")."""
 
     longer_side: int = 320  # pixels; larger frames are reduced on loading
+    detector_weight: float = 0.1
     descriptor_weight: float = 1.0
     stability_weight: float = 1.0
     masked_pixels: float = 8.0  # points nearer than this are not each other's negatives

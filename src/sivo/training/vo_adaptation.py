@@ -39,8 +39,9 @@ class VOAdaptationStage(Stage):
             )  # fmt: skip
             logits = sample_stability(output.stability_logits.float(), batch["stability_points"])
             stability = stability_loss(logits, batch["stability"])
+        total = settings.detector_weight * detector + settings.descriptor_weight * descriptor
         return {
-            "loss": detector + settings.descriptor_weight * descriptor + settings.stability_weight * stability,
+            "loss": total + settings.stability_weight * stability,
             "detector": detector,
             "descriptor": descriptor,
             "stability": stability,
