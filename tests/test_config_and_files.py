@@ -30,6 +30,7 @@ def test_defaults_then_file_then_overrides(tmp_path: Path) -> None:
     path.write_text("count: 5\ninner:\n  width: 2\n")
     settings = config.load(Outer, path, ["inner.width=4", "inner.names=[x, y]", "label=home"])
     assert settings == Outer(5, "home", Inner(4.0, ("x", "y")))
+    assert config.load(Outer, None, ["inner.width=3e-4"]).inner.width == 3e-4
 
 
 def test_a_section_given_in_part_keeps_the_defaults_of_its_place() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 from collections.abc import Iterable
@@ -121,6 +122,9 @@ def _strict(kind: type) -> Any:
     accepted = (int, float) if kind is float else kind
 
     def structure(value: Any, _: Any) -> Any:
+        if kind is float and isinstance(value, str):  # YAML takes 3e-4, without a point, for a word
+            with contextlib.suppress(ValueError):
+                return float(value)
         if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
             raise ValueError(f"{value!r} is not of type {kind.__name__}")
         return kind(value)
