@@ -1,4 +1,4 @@
-"""The loop with the real training, in six steps: nothing gets better, but all of it happens, and survives kills."""
+"""The loop with the real training, in six steps: nothing gets better, but all of it happens, and survives a kill."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ COMMAND = [
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
-def test_a_round_is_the_same_after_kills(tmp_path: Path) -> None:
+def test_a_round_is_the_same_after_a_kill(tmp_path: Path) -> None:
     walk = write_walk(tmp_path / "room", frames=40, seed=3)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
 
@@ -42,14 +42,11 @@ def test_a_round_is_the_same_after_kills(tmp_path: Path) -> None:
     assert start(calm).wait() == 0
     whole = time.monotonic() - began
     chance = random.Random(0)
-    kills = 0
-    for _ in range(2):
-        process = start(killed)
-        time.sleep(chance.uniform(0.2, 0.9) * whole)
-        kills += process.poll() is None
-        process.kill()
-        process.wait()
-    assert kills
+    process = start(killed)
+    time.sleep(chance.uniform(0.3, 0.6) * whole)
+    assert process.poll() is None
+    process.kill()
+    process.wait()
     assert start(killed).wait() == 0
 
     trained = load_weights(calm / "round-1" / "weights.safetensors")
