@@ -223,6 +223,37 @@ def test_the_command_teaches_stability_and_says_so_on_the_card(
     assert "other labels" in capsys.readouterr().err
 
 
+def test_pictures_are_rehearsed_beside_the_labels(store: Path, tiny_weights: Path, tmp_path: Path) -> None:
+    import cv2
+
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    for number in range(3):
+        cv2.imwrite(str(pictures / f"{number}.png"), 255 - draw(number))
+    command = ["train", "odometry", str(store), "-o", str(tmp_path / "out"), "--from", str(tiny_weights)]
+    quick = ["--steps", "6", "--workers", "0", "--batch-size", "2"]
+    assert (
+        main([*command, *quick, "--set", "views.height=64", "--set", "views.width=96", "--pictures", str(pictures)])
+        == 0
+    )
+    card = load_weights(tmp_path / "out" / "weights.safetensors").card
+    assert [source.name for source in card.data] == ["walls", "pictures"]
+
+    from sivo.training.labels import load_labels
+    from sivo.training.pairs import PairBatches
+    from sivo.training.pictures import load_pictures
+    from sivo.training.settings import HomographiesSettings
+
+    settings = settings_of()
+    loaded_pictures = load_pictures([str(pictures)], 160)
+    labels = load_labels(tmp_path / "out" / "labels.npz", [3])
+    other = HomographiesSettings(points=48, optimiser=settings.optimiser, views=settings.views)
+    pairs = TrackedPairs([frames_of(store, PAPER)], settings, PairBatches(loaded_pictures, labels, other))
+    labelled = [(pairs[step]["stability"] != IGNORED).any(axis=1)[:3] for step in range(10)]
+    assert 0.2 < np.mean(labelled) < 0.8
+    assert all((pairs[step]["valid"].sum(axis=1) > 0).all() for step in range(3))
+
+
 def test_labels_without_enough_stable_points_are_one_line(
     store: Path, tiny_weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

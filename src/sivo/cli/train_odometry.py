@@ -31,6 +31,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "labels", nargs="+", type=Path, metavar="LABELS", help="label stores, as `sivo label` makes them"
     )
     parser.add_argument(
+        "--pictures",
+        nargs="+",
+        default=[],
+        metavar="SOURCE[=WEIGHT]",
+        help="image folders or sequences rehearsed beside the labels, as homography pairs, so that the network stays "
+        "general",
+    )
+    parser.add_argument(
         "--data-card", type=Path, metavar="FILE", help="JSON list of name, licence, attribution for the model card"
     )
     parser.add_argument(
@@ -53,5 +61,5 @@ def run(arguments: argparse.Namespace) -> None:
     from sivo.training.stages import train_odometry
 
     start = find_weights(arguments.parent)
-    metrics = train_odometry(arguments.labels, settings, arguments.output, start, data)
+    metrics = train_odometry(arguments.labels, settings, arguments.output, start, data, pictures=arguments.pictures)
     print(summary(arguments.output, metrics))

@@ -46,7 +46,7 @@ class PairBatches:
         cv2.setNumThreads(0)
         seed = self.settings.optimiser.seed
         own = self.share.of(self.settings.optimiser.batch_size)
-        pairs = [self._pair(np.random.default_rng([seed, step, number])) for number in own]
+        pairs = [self.pair(np.random.default_rng([seed, step, number])) for number in own]
         a, b, points = [p[0] for p in pairs], [p[1] for p in pairs], [p[2] for p in pairs]
         return {
             "images": np.stack([view.image for view in a + b])[:, None],
@@ -56,7 +56,8 @@ class PairBatches:
             "valid": np.stack([p[2] for p in points]),
         }
 
-    def _pair(self, rng: np.random.Generator) -> tuple[View, View, tuple[Float32, Float32, np.ndarray]]:
+    def pair(self, rng: np.random.Generator) -> tuple[View, View, tuple[Float32, Float32, np.ndarray]]:
+        """Two views, and places in the first, in the second, and whether both show them."""
         source_index, index_a = self.pictures.draw(rng)
         source = self.pictures.sources[source_index]
         index_b = self._partner(rng, source_index, index_a)

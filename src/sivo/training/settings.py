@@ -137,6 +137,7 @@ class PairSettings:
     largest_gap: int = 60  # frames (paper, "Training Details")
     wide_baselines: float = 0.5  # a gap is drawn with a density that rises with this power of it; 0 is uniform
     same_frame_share: float = 0.3  # of the pairs show one frame twice, where every pixel's partner is known
+    rehearsed_share: float = 0.5  # of the pairs are homography pairs of other pictures, where such are given
     least_points: int = 16  # correspondences that two frames must have; else nearer ones are taken
     points: int = 256  # correspondences taught per pair
     stability_points: int = 200  # labelled points taught per view, at most; as many unstable ones as there are
@@ -149,7 +150,7 @@ class OdometryTrainingSettings:
     """`sivo train odometry`: VO adaptation, from label stores (paper, "Training Details")."""
 
     longer_side: int = 320  # pixels; larger frames are reduced on loading
-    detector_weight: float = 0.1
+    detector_weight: float = 0.3
     descriptor_weight: float = 1.0
     stability_weight: float = 1.0
     masked_pixels: float = 8.0  # points nearer than this are not each other's negatives

@@ -96,6 +96,7 @@ def train_odometry(
     start: Path,
     data: tuple[DataSource, ...] = (),
     progress: bool = True,
+    pictures: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Stage 3, VO adaptation (paper, "Training Details"); returns the last row of metrics.
 
@@ -103,6 +104,7 @@ def train_odometry(
         labels: label stores, as `sivo label` makes them; all their finished sequences are trained on.
         start: weights to start from; the stability head starts from random ones where they have none.
         data: what the model card says about the recordings; their names where it is empty.
+        pictures: sources of homography pairs (`load_pictures`) that are rehearsed beside the labelled video.
 
     Raises:
         InputError: no store, a store whose labels have changed since the folder was begun, or no frame with enough
@@ -119,7 +121,8 @@ def train_odometry(
     architecture = replace(load_weights(start).architecture, stability=True)
     network, parent = _started(architecture, settings.optimiser.seed, start)
     frames = [LabelledFrames(sequence, settings.longer_side, settings.landmarks) for sequence in sequences]
-    pairs = TrackedPairs(frames, settings)
+    rehearsed, sources = _rehearsal(pictures, settings, output, progress)
+    pairs = TrackedPairs(frames, settings, rehearsed)
     if not sum(len(useful) for useful in pairs.useful):
         least = settings.pairs.least_points
         raise InputError(
@@ -127,7 +130,7 @@ def train_odometry(
             "pairs.least_points"
         )
     if not data:
-        data = tuple(DataSource(sequence.name, "not stated") for sequence in sequences)
+        data = tuple(DataSource(name, "not stated") for name in (*(s.name for s in sequences), *sources))
     card = _card(network.architecture, "odometry", settings, data, parent)
     card.training.update(
         stability_trained=True,
@@ -137,6 +140,21 @@ def train_odometry(
         unstable=sum(sequence.record.unstable for sequence in sequences),
     )
     return _run(VOAdaptationStage(network, settings), pairs, settings, output, replace(card, notes=""), progress)
+
+
+def _rehearsal(
+    sources: Sequence[str], settings: OdometryTrainingSettings, output: Path, progress: bool
+) -> tuple[PairBatches | None, list[str]]:
+    """Homography pairs of pictures, labelled by corners as in stage 2, and the names of their sources."""
+    if not sources:
+        return None, []
+    pictures = load_pictures(sources, settings.longer_side, progress)
+    as_before = HomographiesSettings(
+        longer_side=settings.longer_side, points=settings.pairs.points, optimiser=settings.optimiser,
+        views=settings.views, photometric=settings.photometric,
+    )  # fmt: skip
+    labels = _labels(pictures, as_before, output, None, progress)
+    return PairBatches(pictures, labels, as_before), [source.name for source in pictures.sources]
 
 
 def _same_labels(path: Path, sequences: Sequence[LabelledSequence]) -> None:

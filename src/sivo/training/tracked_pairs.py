@@ -11,6 +11,7 @@ import numpy as np
 from sivo.labeling.stability import STABLE, UNSTABLE
 from sivo.training.labelled_frames import FramePoints, LabelledFrames, common_points
 from sivo.training.labels import IGNORED, label_cells
+from sivo.training.pairs import PairBatches, View
 from sivo.training.photometric import augment
 from sivo.training.settings import AdaptationSettings, OdometryTrainingSettings
 from sivo.training.share import Share
@@ -49,10 +50,18 @@ class TrackedPairs:
     A batch has `images` (2B, 1, H, W) uint8, `cells` (2B, Hc, Wc) int64, `points_a`, `points_b` (B, N, 2) float32,
     `valid`, `negative` (B, N) bool, `stability_points` (2B, M, 2) float32 and `stability` (2B, M) int64: 1 stable,
     0 unstable, IGNORED.
+
+    Args:
+        rehearsed: homography pairs of other pictures, which keep the network general; `pairs.rehearsed_share` of all.
     """
 
-    def __init__(self, sequences: Sequence[LabelledFrames], settings: OdometryTrainingSettings) -> None:
-        self.sequences, self.settings = sequences, settings
+    def __init__(
+        self,
+        sequences: Sequence[LabelledFrames],
+        settings: OdometryTrainingSettings,
+        rehearsed: PairBatches | None = None,
+    ) -> None:
+        self.sequences, self.settings, self.rehearsed = sequences, settings, rehearsed
         self.useful = [frames.useful_frames(settings.pairs.least_points) for frames in sequences]
         # as with pictures: long recordings do not drown short ones
         self._cumulative = np.cumsum(np.sqrt([len(useful) for useful in self.useful]))
@@ -80,6 +89,9 @@ class TrackedPairs:
         }
 
     def _pair(self, rng: np.random.Generator) -> tuple[TrackedView, TrackedView, Correspondences]:
+        if self.rehearsed and rng.uniform() < self.settings.pairs.rehearsed_share:
+            first, second, (points_a, points_b, valid) = self.rehearsed.pair(rng)
+            return _unlabelled(first), _unlabelled(second), Correspondences(points_a, points_b, valid, valid)
         chosen = int(np.searchsorted(self._cumulative, rng.uniform(0, self._cumulative[-1]), side="right"))
         frames = self.sequences[chosen]
         frame_a = int(rng.choice(self.useful[chosen]))
@@ -178,6 +190,12 @@ class TrackedPairs:
         points[: len(rows)] = known.points[rows]
         codes[: len(rows)] = known.stability[rows] == STABLE
         return points, codes
+
+
+def _unlabelled(view: View) -> TrackedView:
+    """A view of a picture of which no stability is known."""
+    nothing = FramePoints(np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int8))
+    return TrackedView(view.image, view.cells, nothing, view.view_from_picture)
 
 
 def _empty(count: int) -> Correspondences:
