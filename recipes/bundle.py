@@ -14,6 +14,7 @@ from typing import Any
 
 import cv2
 
+from sivo.cli.train_homographies import read_data_card
 from sivo.frontend.calibration import calibrate
 from sivo.frontend.weights import BUNDLED, load_weights, save_weights
 
@@ -41,6 +42,10 @@ def main() -> None:
     parser.add_argument("weights", type=Path)
     parser.add_argument("name", help="of the bundled weights, and the label of its rows")
     parser.add_argument("pose", nargs="*", metavar="SEQUENCE=POSE.json")
+    parser.add_argument(
+        "--data-card", type=Path, help="what the weights were trained on, where their card does not say it all"
+    )
+    parser.add_argument("--start", help="the bundled weights that they began as")
     parser.add_argument("--calibrate", type=Path, metavar="FOLDER", help="pictures for the int8 runtime")
     arguments = parser.parse_args()
     weights = load_weights(arguments.weights)
@@ -54,6 +59,10 @@ def main() -> None:
         metrics={**training, **({"pose": poses} if poses else {})},
         notes=f"{'' if weights.architecture.stability else NO_HEAD}{ATTRIBUTION}",
     )
+    if arguments.data_card:
+        card = replace(card, data=read_data_card(arguments.data_card))
+    if arguments.start:
+        card = replace(card, training={**card.training, "start": arguments.start})
     weights = replace(weights, card=card)
     if arguments.calibrate:
         files = sorted(arguments.calibrate.glob("*.jpg"))[::6]

@@ -43,11 +43,20 @@ def load_frontend(name: str, max_keypoints: int = 1000, **options: Any) -> Front
     raise ConfigError(f"frontend {name!r}: unknown; choose among {known}, or give a .safetensors weights file")
 
 
-def load_odometry_frontend(name: str, max_keypoints: int = 1000) -> Frontend:
-    """As `load_frontend`, with the classical frontends tuned for odometry: weak points too, spread over the image."""
+def load_odometry_frontend(name: str, max_keypoints: int = 1000, least_stability: float = 0.0) -> Frontend:
+    """As `load_frontend`, with the classical frontends tuned for odometry: weak points too, spread over the image.
+
+    Args:
+        least_stability: keypoints of less stability are dropped; 0 keeps all.
+    """
     options: dict[str, Any] = {}
     if name in CLASSICAL:
         options["sensitive"] = True
     if name == "orb":
         options["spread"] = True
-    return load_frontend(name, max_keypoints, **options)
+    frontend = load_frontend(name, max_keypoints, **options)
+    if not least_stability:
+        return frontend
+    from sivo.frontend.stable_only import StableOnly
+
+    return StableOnly(frontend, least_stability)

@@ -71,7 +71,9 @@ def run_odometry(
         InputError: fewer than three readable frames.
         OutputError: the folder cannot be used.
     """
-    frontend = frontend or load_odometry_frontend(settings.frontend.name, settings.frontend.max_keypoints)
+    frontend = frontend or load_odometry_frontend(
+        settings.frontend.name, settings.frontend.max_keypoints, settings.frontend.least_stability
+    )
     viewer = viewer or NullViewer()
     if sequence.length is not None and sequence.length < _MIN_FRAMES:
         raise InputError(f"{sequence.path}: has {sequence.length} frames; odometry needs at least {_MIN_FRAMES}")

@@ -20,7 +20,11 @@ class FrontendSettings:
     max_keypoints: int = 1000
     use_stability: bool = True  # weigh observations with the frontend's stability, where it has one
 
+    least_stability: float = 0.0  # drop keypoints that the frontend's stability head gives less; 0 keeps all
+
     def __post_init__(self) -> None:
+        if not 0 <= self.least_stability <= 1:
+            raise ConfigError(f"least_stability={self.least_stability}: is a probability between 0 and 1")
         if self.max_keypoints < 50:
             raise ConfigError(f"max_keypoints={self.max_keypoints}: odometry needs at least 50; 1000 is a good start")
 
