@@ -112,12 +112,12 @@ def test_descriptors_are_sampled_as_torch_samples_them():
 
 def test_suppression_keeps_the_best_of_each_neighbourhood():
     heat = np.zeros((40, 40), np.float32)
-    heat[10, 10], heat[10, 14], heat[10, 19], heat[30, 30] = 0.9, 0.8, 0.7, 0.004
+    heat[10, 10], heat[10, 14], heat[10, 19], heat[30, 30] = 0.9, 0.8, 0.7, 0.0004
     found = find_keypoints(heat, NetworkSettings(nms_radius=4))
     assert found.tolist() == [[10, 10], [19, 10]]
     assert find_keypoints(heat, NetworkSettings(nms_radius=3)).tolist() == [[10, 10], [14, 10], [19, 10]]
     assert find_keypoints(heat, NetworkSettings(nms_radius=3, max_keypoints=2)).tolist() == [[10, 10], [14, 10]]
-    assert [30, 30] in find_keypoints(heat, NetworkSettings(threshold=0.001)).tolist()
+    assert [30, 30] in find_keypoints(heat, NetworkSettings(threshold=0.0001)).tolist()
 
 
 def test_refinement_finds_the_centre_of_a_blob():

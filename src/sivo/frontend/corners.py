@@ -25,53 +25,60 @@ def refine_to_corners(image: Float32, keypoints: Float32, radius: int) -> Float3
     """
     if not len(keypoints):
         return keypoints
-    return np.asarray(
-        _refine(np.ascontiguousarray(image, np.float32), np.ascontiguousarray(keypoints, np.float32), radius)
-    )
+    steps = np.arange(-radius, radius + 1)
+    falloff = np.exp(-(steps[:, None] ** 2 + steps**2) / (2 * (radius / 1.5) ** 2)).astype(np.float32)
+    image = np.ascontiguousarray(image, np.float32)
+    return np.asarray(_refine(image, np.ascontiguousarray(keypoints, np.float32), radius, falloff))
 
 
 @numba.njit(cache=True, nogil=True)
-def _refine(image, keypoints, radius):  # type: ignore[no-untyped-def]
+def _refine(image, keypoints, radius, falloff):  # type: ignore[no-untyped-def]
     height, width = image.shape
     reach = radius + 1  # the parabola needs the neighbours of the best
     side = 2 * (reach + _EDGE) + 1
-    smooth = np.empty((side, side), np.float32)
-    xx, yy, xy = np.empty_like(smooth), np.empty_like(smooth), np.empty_like(smooth)
     count = 2 * reach + 1
+    patch = np.empty((side, side), np.float32)
+    across = np.empty((side, side - 2), np.float32)
+    smooth = np.empty((side - 2, side - 2), np.float32)
+    xx = np.empty((side - 4, side - 4), np.float32)
+    yy, xy = np.empty_like(xx), np.empty_like(xx)
     response = np.empty((count, count), np.float32)
-    falloff = 1.0 / (2.0 * (radius / 1.5) ** 2)
     result = keypoints.copy()
+    quarter, half = np.float32(0.25), np.float32(0.5)
     for n in range(len(keypoints)):
         x0, y0 = round(keypoints[n, 0]), round(keypoints[n, 1])
-        for i in range(side):  # 3×3 binomial smoothing, the image repeated beyond its edges
+        left, top = x0 - reach - _EDGE, y0 - reach - _EDGE
+        for i in range(side):  # the image is repeated beyond its edges
+            y = min(max(top + i, 0), height - 1)
             for j in range(side):
-                total = np.float32(0)
-                for v in range(-1, 2):
-                    y = min(max(y0 - reach - _EDGE + i + v, 0), height - 1)
-                    for u in range(-1, 2):
-                        x = min(max(x0 - reach - _EDGE + j + u, 0), width - 1)
-                        total += image[y, x] * np.float32((2 - abs(u)) * (2 - abs(v)))
-                smooth[i, j] = total / 16
-        for i in range(1, side - 1):
-            for j in range(1, side - 1):
-                gx, gy = 0.5 * (smooth[i, j + 1] - smooth[i, j - 1]), 0.5 * (smooth[i + 1, j] - smooth[i - 1, j])
+                patch[i, j] = image[y, min(max(left + j, 0), width - 1)]
+        for i in range(side):  # binomial smoothing, 3×3
+            for j in range(side - 2):
+                across[i, j] = quarter * (patch[i, j] + patch[i, j + 2]) + half * patch[i, j + 1]
+        for i in range(side - 2):
+            for j in range(side - 2):
+                smooth[i, j] = quarter * (across[i, j] + across[i + 2, j]) + half * across[i + 1, j]
+        for i in range(side - 4):
+            for j in range(side - 4):
+                gx = half * (smooth[i + 1, j + 2] - smooth[i + 1, j])
+                gy = half * (smooth[i + 2, j + 1] - smooth[i, j + 1])
                 xx[i, j], yy[i, j], xy[i, j] = gx * gx, gy * gy, gx * gy
-        best, row, column = 0.0, -1, -1
+        best, row, column = np.float32(0), -1, -1
         for i in range(count):
             for j in range(count):
-                a, b, c = 0.0, 0.0, 0.0
-                for v in range(i + _EDGE - 1, i + _EDGE + 2):
-                    for u in range(j + _EDGE - 1, j + _EDGE + 2):
-                        a += xx[v, u]
-                        b += xy[v, u]
-                        c += yy[v, u]
-                response[i, j] = 0.5 * (a + c) - np.sqrt(0.25 * (a - c) ** 2 + b * b)
-                dx, dy = j - reach, i - reach
-                y, x = y0 + dy, x0 + dx
-                if abs(dx) > radius or abs(dy) > radius or x < 1 or y < 1 or x > width - 2 or y > height - 2:
+                a, b, c = np.float32(0), np.float32(0), np.float32(0)
+                for v in range(3):
+                    a += xx[i + v, j] + xx[i + v, j + 1] + xx[i + v, j + 2]
+                    b += xy[i + v, j] + xy[i + v, j + 1] + xy[i + v, j + 2]
+                    c += yy[i + v, j] + yy[i + v, j + 1] + yy[i + v, j + 2]
+                response[i, j] = half * (a + c) - np.sqrt(quarter * (a - c) * (a - c) + b * b)
+        for i in range(1, count - 1):
+            for j in range(1, count - 1):
+                value = response[i, j] * falloff[i - 1, j - 1]
+                if value <= best or response[i, j] <= _LEAST_RESPONSE:
                     continue
-                value = response[i, j] * np.exp(-falloff * (dx * dx + dy * dy))
-                if response[i, j] > _LEAST_RESPONSE and value > best:
+                x, y = x0 + j - reach, y0 + i - reach
+                if 1 <= x <= width - 2 and 1 <= y <= height - 2:
                     best, row, column = value, i, j
         if row < 0:
             continue
@@ -83,8 +90,8 @@ def _refine(image, keypoints, radius):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _peak(before, middle, after):  # type: ignore[no-untyped-def]
-    """Where, between -0.5 and 0.5, the parabola through three values is largest; 0 if the middle is no maximum."""
+    """Where, at most half a pixel away, the parabola through three values is largest; 0 if it opens upwards."""
     bend = before - 2 * middle + after
-    if bend >= 0 or middle < before or middle < after:
+    if bend >= 0:
         return 0.0
-    return 0.5 * (before - after) / bend
+    return min(max(0.5 * (before - after) / bend, -0.5), 0.5)
