@@ -90,8 +90,8 @@ def _refine(image, keypoints, radius, falloff):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _peak(before, middle, after):  # type: ignore[no-untyped-def]
-    """Where, at most half a pixel away, the parabola through three values is largest; 0 if it opens upwards."""
+    """Where, at most half a pixel away, the parabola through three values is largest; 0 if the middle is no maximum."""
     bend = before - 2 * middle + after
-    if bend >= 0:
+    if bend >= 0 or max(before, after) > 1.001 * middle:  # equal but for rounding: the peak is half-way
         return 0.0
     return min(max(0.5 * (before - after) / bend, -0.5), 0.5)
