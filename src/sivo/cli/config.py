@@ -18,6 +18,7 @@ SETTINGS = {  # command -> its settings
     "evaluate-homography": "sivo.evaluation.settings:HomographyCommandSettings",
     "train-shapes": "sivo.training.settings:ShapesSettings",
     "train-homographies": "sivo.training.settings:HomographiesSettings",
+    "train-odometry": "sivo.training.settings:OdometryTrainingSettings",
 }
 
 
