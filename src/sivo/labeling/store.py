@@ -25,6 +25,7 @@ from typing import Any
 
 import yaml
 
+from sivo.config import first_difference
 from sivo.errors import ConfigError, InputError, OutputError
 from sivo.files import check_output_folder, make_output_folder, write_json, write_text, written_atomically
 
@@ -76,7 +77,7 @@ class LabelStore:
         before = folder / SETTINGS_FILE
         if before.is_file() and before.read_text() != text:
             if not relabel:
-                changed = _changed(yaml.safe_load(before.read_text()), settings)
+                changed = first_difference(yaml.safe_load(before.read_text()), settings)
                 raise ConfigError(f"{folder}: its labels were made with {changed}; use another folder, or --relabel")
             for record in self.records():
                 if record.state == DONE:
@@ -180,12 +181,3 @@ def sequence_names(paths: list[Path]) -> dict[str, Path]:
             name, number = f"{resolved.parent.name}-{stem}" if number == 2 else f"{stem}-{number}", number + 1
         names[name] = resolved
     return names
-
-
-def _changed(before: Any, now: Any, prefix: str = "") -> str:
-    """The first setting that differs, in words."""
-    if isinstance(before, dict) and isinstance(now, dict):
-        for key in [*before, *(key for key in now if key not in before)]:
-            if before.get(key) != now.get(key):
-                return _changed(before.get(key), now.get(key), f"{prefix}{key}.")
-    return f"{prefix.rstrip('.')}={before}, now {now}"

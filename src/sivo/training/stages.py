@@ -299,19 +299,9 @@ def _same_settings(path: Path, settings: StageSettings) -> None:
 
     if path.is_file():
         before, now = fixed(config.to_dict(config.load(type(settings), path))), fixed(config.to_dict(settings))
-        changed = _changed(before, now)
+        changed = config.first_difference(before, now)
         if changed:
             raise ConfigError(
-                f"{path.parent}: was begun with another {changed[0]}; give the same settings or another output folder"
+                f"{path.parent}: was begun with {changed}; give the same settings or another output folder"
             )
     files.write_text(path, config.to_yaml(settings))
-
-
-def _changed(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> list[str]:
-    names = []
-    for key, value in now.items():
-        if isinstance(value, dict):
-            names += _changed(before[key], value, f"{prefix}{key}.")
-        elif before[key] != value:
-            names.append(prefix + key)
-    return names
