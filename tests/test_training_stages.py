@@ -131,10 +131,11 @@ def test_the_shapes_stage_leaves_the_descriptor_alone(tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = SuperPoint(TINY)
     before = {name: value.clone() for name, value in network.descriptor.state_dict().items()}
-    settings = ShapesSettings(optimiser=optimiser(steps=10), views=VIEWS)
+    settings = ShapesSettings(optimiser=optimiser(steps=60, batch_size=8, learning_rate=1e-2), views=VIEWS)
     Trainer(MagicPointStage(network), ShapeBatches(settings), settings.optimiser, tmp_path).run(progress=False)
     assert all(torch.equal(value, before[name]) for name, value in network.descriptor.state_dict().items())
-    assert losses_of(tmp_path)[-1] < losses_of(tmp_path)[0]
+    curve = losses_of(tmp_path)
+    assert np.mean(curve[-3:]) < 0.9 * np.mean(curve[:3])
 
 
 def test_ignored_cells_do_not_teach() -> None:
