@@ -22,12 +22,14 @@ from sivo.improvement.improve import Improvement, improve
 from sivo.improvement.settings import HeldBackSettings, ImproveSettings, JudgeSettings
 from sivo.labeling.settings import LabelSettings
 from sivo.odometry.run_settings import FrontendSettings
+from sivo.odometry.settings import OdometrySettings, StartSettings
 from sivo.training.settings import OdometryTrainingSettings
 
 SPOILED = "spoiled"  # stands for bundled weights with so much noise that a sixth of the matches is lost
 SETTINGS = ImproveSettings(
     frontend=FrontendSettings(SPOILED, max_keypoints=250),
     labels=LabelSettings(min_observations=6),
+    odometry=OdometrySettings(start=StartSettings(max_homography_ratio=0.9)),  # the room is mostly one wall
     held_back=HeldBackSettings(0.3),
     judge=JudgeSettings(SurvivalSettings(gaps=(4, 8), pairs=6, min_pairs=2, max_keypoints=250), calibration_images=2),
 )

@@ -30,7 +30,7 @@ class Telling:
         """A progress bar with its rate and what remains; call what it gives."""
         from tqdm import tqdm
 
-        with tqdm(desc=words, unit=unit, total=total, smoothing=0.1, delay=0.5, disable=not self.progress) as bar:
+        with tqdm(desc=words, unit=unit, total=total, smoothing=0.1, disable=not self.progress) as bar:
 
             def tick(count: int = 1) -> None:
                 bar.update(count)
