@@ -127,13 +127,13 @@ def judge_labels(labels: Path, simulation: Path) -> Judged:
 
 def median_errors(track: Int64, error: Float32, wanted: Int64) -> Float64:
     """Median error (T,) of each wanted track, from rows of observations (M,); NaN rows do not count."""
-    known = np.isfinite(error)
-    order = np.lexsort((error[known], track[known]))
-    ids, sorted_error = track[known][order], error[known][order].astype(np.float64)
-    start, end = (np.searchsorted(ids, wanted, side=side) for side in ("left", "right"))
-    if not (end > start).all():
+    from sivo.labeling.grouping import medians, rows_of
+
+    of_wanted = np.isin(track, wanted)
+    result = medians(rows_of(wanted, track[of_wanted]), error[of_wanted], len(wanted))
+    if np.isnan(result).any():
         raise InputError("a labelled track has no error in tracks.parquet; run the sequence again")
-    return (sorted_error[start + (end - start - 1) // 2] + sorted_error[start + (end - start) // 2]) / 2
+    return result
 
 
 def judge_frontend(frontend: Any, simulation: Path, stride: int = 10, threshold: float = 0.5) -> Judged:

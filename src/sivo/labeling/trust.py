@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sivo.labeling.grouping import rows_of
 from sivo.labeling.settings import LabelSettings
 from sivo.labeling.stability import IGNORE
 from sivo.labeling.tables import PointsTable, TracksTable
@@ -59,7 +60,7 @@ def judge_frames(
     """
     rule = settings.second_opinion
     frames = len(has_pose)
-    track_row = _rows_of(points.track, tracks.track)
+    track_row = rows_of(points.track, tracks.track)
     long_enough = (points.observations >= settings.min_observations)[track_row] & np.isfinite(tracks.error)
     frame = tracks.frame[long_enough]
     error = _median_by(frame, tracks.error[long_enough].astype(np.float64), frames)
@@ -80,7 +81,7 @@ def judge_frames(
 
 def withhold_labels(points: PointsTable, tracks: TracksTable, trusted: Mask, settings: LabelSettings) -> PointsTable:
     """The points with the labels of tracks that live mostly in frames that are not trusted set to `ignore`."""
-    track_row = _rows_of(points.track, tracks.track)
+    track_row = rows_of(points.track, tracks.track)
     used = np.isfinite(tracks.error)
     observed = np.bincount(track_row[used], minlength=len(points))
     believed = np.bincount(track_row[used], weights=trusted[tracks.frame[used]], minlength=len(points))
@@ -88,12 +89,6 @@ def withhold_labels(points: PointsTable, tracks: TracksTable, trusted: Mask, set
     withheld = doubtful & (points.stability != IGNORE)
     stability = np.where(withheld, IGNORE, points.stability).astype(np.int8)
     return replace(points, stability=stability, withheld=points.withheld | withheld)
-
-
-def _rows_of(ids: Int64, wanted: Int64) -> Int64:
-    """The row of `ids` (unique) that holds each wanted id."""
-    order = np.argsort(ids, kind="stable")
-    return order[np.searchsorted(ids, wanted, sorter=order)] if len(ids) else np.zeros(0, np.int64)
 
 
 def _median_by(group: Int64, values: Float64, groups: int) -> Float64:

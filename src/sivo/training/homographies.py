@@ -28,12 +28,7 @@ class JointStage(Stage):
         """See `Stage`; `batch` is that of `PairBatches`."""
         settings = self.settings
         shared = self.network.encode(batch["images"])
-        detector = detector_loss(
-            self.network.detector(shared),
-            batch["cells"],
-            settings.detector.position_weight,
-            settings.detector.position_sigma,
-        )
+        detector = detector_loss(self.network.detector(shared), batch["cells"], settings.detector)
         first, second = self.network.descriptor(shared).float().chunk(2)
         with torch.autocast(first.device.type, enabled=False):
             points_a, points_b, valid = batch["points_a"], batch["points_b"], batch["valid"]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sivo.geometry.se3 import transform
+from sivo.labeling.grouping import medians, rows_of
 from sivo.labeling.labelled import LabelledSequence
 from sivo.labeling.stability import IGNORE, STABLE, UNSTABLE
 from sivo.training.settings import LandmarkSettings
@@ -86,12 +87,11 @@ class LabelledFrames:
         order = np.argsort(table.frame, kind="stable")
         self._start = np.searchsorted(table.frame[order], np.arange(len(self) + 1))
         self._keypoints: Float32 = table.keypoints[order]
-        by_track = np.argsort(points.track, kind="stable")
-        track_of_row = by_track[np.searchsorted(points.track[by_track], table.track)]
+        track_of_row = rows_of(points.track, table.track)
         track = track_of_row[order]
         landmark_of_track, stability = self._landmarks_of_tracks()
         if self.settings.unstable_median_error > 0:
-            unsure = _medians(table.error, track_of_row, len(points)) < self.settings.unstable_median_error
+            unsure = medians(track_of_row, table.error, len(points)) < self.settings.unstable_median_error
             stability = np.where((stability == UNSTABLE) & unsure, IGNORE, stability).astype(np.int8)
         _, representative, landmark_of_track = np.unique(landmark_of_track, return_index=True, return_inverse=True)
         self._landmark: Int64 = landmark_of_track[track]
@@ -205,20 +205,6 @@ class LabelledFrames:
 
     def _to_picture(self, pixels: Float64) -> Float64:
         return (pixels + 0.5) * self.scale - 0.5
-
-
-def _medians(values: Float32, group: Int64, count: int) -> Float64:
-    """(count,) median of the known values of each group, NaN where it has none."""
-    known = np.isfinite(values)
-    order = np.lexsort((values[known], group[known]))
-    ordered, group = values[known][order].astype(np.float64), group[known][order]
-    start = np.searchsorted(group, np.arange(count))
-    number = np.searchsorted(group, np.arange(count), side="right") - start
-    result = np.full(count, np.nan)
-    some = number > 0
-    low, high = start[some] + (number[some] - 1) // 2, start[some] + number[some] // 2
-    result[some] = 0.5 * (ordered[low] + ordered[high])
-    return result
 
 
 def common_points(a: FramePoints, b: FramePoints) -> tuple[Int64, Int64]:

@@ -7,9 +7,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from sivo.training.labels import DUSTBIN, IGNORED
+from sivo.training.settings import DetectorLossSettings
 
 
-def detector_loss(logits: Tensor, cells: Tensor, position_weight: float = 0.0, position_sigma: float = 0.7) -> Tensor:
+def detector_loss(logits: Tensor, cells: Tensor, settings: DetectorLossSettings | None = None) -> Tensor:
     """Softmax cross-entropy over the 65 classes of a cell; ignored cells count for nothing (paper, "Training Details").
 
     Most cells have no keypoint, so this alone teaches for a long time only whether there is one. The position term,
@@ -19,19 +20,18 @@ def detector_loss(logits: Tensor, cells: Tensor, position_weight: float = 0.0, p
     Args:
         logits: (B, 65, Hc, Wc).
         cells: (B, Hc, Wc) int64, 0..64 or `IGNORED`.
-        position_weight: of the position term; 0 is SuperPoint's loss.
-        position_sigma: pixels, of the Gaussian.
+        settings: of the position term; without it this is SuperPoint's loss.
     """
     logits = logits.float()
     total = functional.cross_entropy(logits, cells, ignore_index=IGNORED, reduction="sum")
     loss = total / (cells != IGNORED).sum().clamp(min=1)
-    if not position_weight:
+    if settings is None or not settings.position_weight:
         return loss
     taught = (cells >= 0) & (cells < DUSTBIN)
     pixels = logits[:, :DUSTBIN].permute(0, 2, 3, 1)[taught]
-    targets = _gaussians(position_sigma).to(pixels)[cells[taught]]
+    targets = _gaussians(settings.position_sigma).to(pixels)[cells[taught]]
     position = functional.cross_entropy(pixels, targets, reduction="sum") / taught.sum().clamp(min=1)
-    return loss + position_weight * position
+    return loss + settings.position_weight * position
 
 
 def _gaussians(sigma: float) -> Tensor:

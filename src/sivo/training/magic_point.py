@@ -24,5 +24,4 @@ class MagicPointStage(Stage):
     def losses(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """See `Stage`; `batch` is that of `ShapeBatches`."""
         logits = self.network.detector(self.network.encode(batch["images"]))
-        weight, sigma = self.settings.position_weight, self.settings.position_sigma
-        return {"loss": detector_loss(logits, batch["cells"], weight, sigma)}
+        return {"loss": detector_loss(logits, batch["cells"], self.settings)}

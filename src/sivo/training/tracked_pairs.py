@@ -10,7 +10,7 @@ import numpy as np
 
 from sivo.labeling.stability import STABLE, UNSTABLE
 from sivo.training.labelled_frames import FramePoints, LabelledFrames, common_points
-from sivo.training.labels import IGNORED, label_cells
+from sivo.training.labels import DUSTBIN, IGNORED, label_cells
 from sivo.training.pairs import PairBatches, View
 from sivo.training.photometric import augment
 from sivo.training.settings import AdaptationSettings, OdometryTrainingSettings
@@ -138,9 +138,7 @@ class TrackedPairs:
         agreement = np.where(known.stability == STABLE, _CERTAIN, _UNDECIDED).astype(np.float32)
         cells = label_cells(points, agreement, visible, width, height, AdaptationSettings())
         if not settings.pairs.untracked_is_background:
-            stable = points[known.stability == STABLE]
-            taught = label_cells(stable, np.ones(len(stable), np.float32), visible, width, height, AdaptationSettings())
-            cells = np.where(taught < 64, taught, IGNORED)
+            cells[cells == DUSTBIN] = IGNORED
         return TrackedView(image, cells, FramePoints(points, known.landmark, known.stability), H)
 
     def _two_frames(

@@ -26,9 +26,7 @@ class VOAdaptationStage(Stage):
         """See `Stage`; `batch` is that of `TrackedPairs`."""
         settings = self.settings
         output = self.network(batch["images"])
-        detector = detector_loss(
-            output.detector_logits, batch["cells"], settings.detector.position_weight, settings.detector.position_sigma
-        )
+        detector = detector_loss(output.detector_logits, batch["cells"], settings.detector)
         with torch.autocast(output.descriptors.device.type, enabled=False):
             first, second = output.descriptors.float().chunk(2)
             points_a, points_b = batch["points_a"], batch["points_b"]
