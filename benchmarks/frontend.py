@@ -28,6 +28,7 @@ from sivo.frontend.architecture import ARCHITECTURES
 from sivo.frontend.calibration import calibrate
 from sivo.frontend.classical import ClassicalFrontend
 from sivo.frontend.decoding import decode
+from sivo.frontend.live_channels import without_dead_channels
 from sivo.frontend.network import NetworkFrontend, prepare
 from sivo.frontend.settings import NetworkSettings
 from sivo.frontend.weights import ModelCard, Weights, bundled_names, expected_shapes, find_weights, load_weights
@@ -142,7 +143,7 @@ def measure(weights: Weights, name: str, frames: tuple[UInt8, UInt8], arguments:
         **onnx_contenders(calibrated, batch, arguments.threads),
     }
     milliseconds = median_milliseconds(timed, arguments.rounds, CLOCKS[arguments.clock])
-    operations = 2 * weights.architecture.multiplications(height, width)
+    operations = 2 * without_dead_channels(weights).architecture.multiplications(height, width)
     return {
         "weights": name,
         "size": [width, height],

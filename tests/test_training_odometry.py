@@ -190,8 +190,10 @@ def test_the_stability_loss_is_balanced() -> None:
     logits = torch.tensor([[[0.0, 2.0]] * 9 + [[0.0, 2.0]]])
     stability = torch.tensor([[1] * 9 + [0]])
     right, wrong = np.log(1 + np.exp(-2.0)), np.log(1 + np.exp(2.0))
-    assert float(stability_loss(logits, stability)) == pytest.approx(0.5 * (right + wrong), rel=1e-5)
-    assert float(stability_loss(logits, torch.full((1, 10), IGNORED))) == 0.0
+    assert float(stability_loss(logits, stability, 9.0)) == pytest.approx(0.5 * (right + wrong), rel=1e-5)
+    assert float(stability_loss(logits, torch.full((1, 10), IGNORED), 9.0)) == 0.0
+    # where unstable labels are rarer elsewhere, the one here does not weigh as much as the nine
+    assert float(stability_loss(logits, stability, 3.0)) == pytest.approx(0.5 * (right + wrong / 3), rel=1e-5)
 
 
 def test_the_command_teaches_stability_and_says_so_on_the_card(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sivo import config, files
 from sivo.errors import MissingExtraError
 from sivo.frontend.architecture import CELL, POOL_AFTER
+from sivo.frontend.live_channels import without_dead_channels
 from sivo.frontend.settings import NetworkSettings
 from sivo.frontend.weights import FoldedLayer, Weights
 
@@ -38,7 +39,7 @@ def export_onnx(weights: Weights, path: Path, settings: NetworkSettings) -> None
         raise MissingExtraError("exporting ONNX", "onnx") from None
 
     graph = _Graph(helper, onnx.numpy_helper)
-    outputs = _build(graph, weights, settings)
+    outputs = _build(graph, without_dead_channels(weights), settings)
     float32, boolean = onnx.TensorProto.FLOAT, onnx.TensorProto.BOOL
     count, width = settings.max_keypoints, weights.architecture.descriptor
     tails: dict[str, list[int]] = {"keypoints": [count, 2], "descriptors": [count, width]}

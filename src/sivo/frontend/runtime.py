@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 from sivo.errors import ConfigError
+from sivo.frontend.live_channels import without_dead_channels
 from sivo.frontend.settings import NetworkSettings
 from sivo.frontend.weights import Weights
 from sivo.types import Float32
@@ -35,6 +36,7 @@ def open_runtime(weights: Weights, settings: NetworkSettings) -> Runtime:
         ConfigError: a precision that the runtime or the weights do not have.
         MissingExtraError: the runtime's library is not installed.
     """
+    weights = without_dead_channels(weights)
     name = settings.runtime
     if name == "auto":
         name = "torch" if settings.device == "cuda" or settings.precision == "float16" else "openvino"

@@ -29,6 +29,7 @@ class FramePoints:
     points: Float64  # (N, 2)
     landmark: Int64  # (N,)
     stability: Codes  # (N,) codes of `sivo.labeling.stability`
+    seen: NDArray[np.bool_]  # (N,) whether a track saw it in this frame, or only the projection says that it is there
 
 
 class LabelledFrames:
@@ -75,11 +76,18 @@ class LabelledFrames:
         places = places[first]
         if self.settings.reprojected:
             places = self._at_projection(frame, landmark, places)
+        observed = len(landmark)
         if self.settings.unseen:
             others, projected = self._unseen(frame, landmark)
             landmark, places = np.concatenate([landmark, others]), np.concatenate([places, projected])
         order = np.argsort(self._mean_error[landmark], kind="stable")
-        return FramePoints(self._to_picture(places[order]), landmark[order], self._stability[landmark[order]])
+        stability = self._stability[landmark[order]]
+        return FramePoints(self._to_picture(places[order]), landmark[order], stability, order < observed)
+
+    def taught_stability(self) -> tuple[int, int]:
+        """How many observations of stable, and of unstable points there are."""
+        codes = self._stability[self._landmark]
+        return int((codes == STABLE).sum()), int((codes == UNSTABLE).sum())
 
     def _index_observations(self) -> None:
         """Observations sorted by frame, and the landmark that each of them is of."""
@@ -187,7 +195,11 @@ class LabelledFrames:
         return rows[kept], pixels[kept]
 
     def _hidden(self, frame: int, seen: Int64, pixels: Float64, depth: Float64) -> NDArray[np.bool_]:
-        """(N,) whether a point that the frame does show is near in the image and clearly nearer to the camera."""
+        """(N,) whether a point is not to be believed visible.
+
+        Either a point that the frame does show is near in the image and clearly nearer to the camera; or none is near
+        at all: a person who walks through hides the wall and has no stable points to say so.
+        """
         from scipy.spatial import cKDTree
 
         if not len(pixels):
@@ -201,7 +213,7 @@ class LabelledFrames:
         distance, nearest = distance.reshape(len(pixels), -1), nearest.reshape(len(pixels), -1)
         nearer = shown_depth[known][nearest] < (1 - self.settings.occlusion_depth) * depth[:, None]
         close = distance * self.scale <= self.settings.occlusion_pixels
-        return np.asarray((nearer & close).any(axis=1))
+        return np.asarray((nearer & close).any(axis=1) | ~close.any(axis=1))
 
     def _to_picture(self, pixels: Float64) -> Float64:
         return (pixels + 0.5) * self.scale - 0.5

@@ -99,13 +99,17 @@ def hinge_loss(
     return (torch.where(same, positive, negative) * valid[:, :, None]).sum() / (valid.sum().clamp(min=1) * b.shape[1])
 
 
-def stability_loss(logits: Tensor, stability: Tensor) -> Tensor:
-    """Binary cross-entropy, balanced: stable and unstable points weigh the same, however many there are.
+def stability_loss(logits: Tensor, stability: Tensor, stable_per_unstable: float) -> Tensor:
+    """Binary cross-entropy, balanced: over all labels, stable and unstable points weigh the same.
+
+    The balance is that of the whole label set, not of the batch: in a batch with one unstable point that one would
+    weigh as much as all others together, and such lone points are the wrong labels more often than others.
 
     Args:
         logits: (B, N, 2) at labelled points; channel 1 is "stable".
         stability: (B, N) int64, 1 stable, 0 unstable, `IGNORED`.
+        stable_per_unstable: how many labels of one kind there are for one of the other.
     """
     errors = functional.cross_entropy(logits.transpose(1, 2), stability, ignore_index=IGNORED, reduction="none")
-    halves = [(errors * (stability == code)).sum() / (stability == code).sum().clamp(min=1) for code in (0, 1)]
-    return 0.5 * (halves[0] + halves[1])
+    stable, unstable = ((errors * (stability == code)).sum() for code in (1, 0))
+    return 0.5 * (stable + stable_per_unstable * unstable) / (stability == 1).sum().clamp(min=1)

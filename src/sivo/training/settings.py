@@ -87,6 +87,9 @@ class HomographiesSettings:
     """`sivo train homographies`: homographic adaptation, then detector and descriptor on pairs of views."""
 
     architecture: str = "superpoint"
+    # channels of the first four layers that are used, the others stay zero (`sivo.frontend.live_channels`); 0 for as
+    # many as the weights use that are started from
+    stem_channels: int = 0
     longer_side: int = 320  # pixels; larger pictures are reduced on loading
     shapes: int = 450  # drawn pictures with exact corners among the others; 0 leaves them out
     shapes_share: float = 0.12  # of the pairs
@@ -126,7 +129,8 @@ class LandmarkSettings:
     largest_correction: float = 2.0  # pixels of the recording between the two; beyond it the keypoint holds
     largest_view_angle_degrees: float = 40.0  # from the mean direction in which an unseen point was seen
     largest_distance_ratio: float = 1.7  # to its mean distance, in either direction
-    occlusion_pixels: float = 14.0  # a nearer point within this radius hides an unseen one
+    # within this radius of an unseen point, a nearer point of the frame hides it, and one must be seen at all
+    occlusion_pixels: float = 14.0
     occlusion_depth: float = 0.15  # by how much nearer, as a share
 
 
@@ -153,6 +157,7 @@ class OdometryTrainingSettings:
     detector_weight: float = 0.3
     descriptor_weight: float = 1.0
     stability_weight: float = 1.0
+    stability_alone: bool = False  # train only that head, on what the others read: keypoints and descriptors stay
     masked_pixels: float = 8.0  # points nearer than this are not each other's negatives
     detector: DetectorLossSettings = field(default_factory=DetectorLossSettings)
     pairs: PairSettings = field(default_factory=PairSettings)

@@ -15,6 +15,7 @@ import torch
 from sivo import __version__, config, files
 from sivo.errors import ConfigError, InputError
 from sivo.frontend.architecture import ARCHITECTURES, Architecture
+from sivo.frontend.live_channels import with_dead_channels, without_dead_channels
 from sivo.frontend.superpoint import SuperPoint
 from sivo.frontend.weights import DataSource, ModelCard, Weights, load_weights, save_weights
 from sivo.training.adaptation import Detector, adapt, network_detector, shi_tomasi
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 WEIGHTS = "weights.safetensors"
 SETTINGS = "settings.yaml"
 LABELS = "labels.npz"
+STEM_LAYERS = 4  # of the encoder, at full and half resolution
 StageSettings = ShapesSettings | HomographiesSettings | OdometryTrainingSettings
 LABEL_STORES = "label-stores.json"
 SHAPES = DataSource("procedural shapes", "Apache-2.0", "Drawn by sivo.training.shapes.")
@@ -44,7 +46,8 @@ def train_shapes(
 ) -> dict[str, Any]:
     """Stage 1: a detector from drawn shapes alone; returns the last row of metrics."""
     network, parent = _network(settings.architecture, settings.optimiser.seed, start)
-    card = _card(network.architecture, "shapes", settings, (SHAPES,), parent)
+    published = replace(ARCHITECTURES[settings.architecture], stability=False)
+    card = _card(published, "shapes", settings, (SHAPES,), parent)
     return _run(MagicPointStage(network, settings.detector), ShapeBatches(settings), settings, output, card, progress)
 
 
@@ -70,7 +73,7 @@ def train_homographies(
         print(f"skipped {name}: cannot be read")
     if pictures.skipped:
         print(f"{len(pictures.skipped)} pictures skipped, {len(pictures)} read")
-    network, parent = _network(settings.architecture, settings.optimiser.seed, start)
+    network, parent = _network(settings.architecture, settings.optimiser.seed, start, settings.stem_channels)
     files.make_output_folder(output, "train homographies")
     labels = _labels(pictures, settings, output, detector, progress)
     if not data:
@@ -80,7 +83,8 @@ def train_homographies(
         source, drawn = shape_source(settings.shapes, settings.optimiser.seed, weight)
         pictures = replace(pictures, sources=(*pictures.sources, source))
         labels, data = [*labels, drawn], (*data, SHAPES)
-    card = _card(network.architecture, "homographies", settings, data, parent)
+    published = replace(ARCHITECTURES[settings.architecture], stability=False)
+    card = _card(published, "homographies", settings, data, parent)
     card.training.update(
         detector_labels=str(detector.name) if detector else "shi-tomasi", pictures=len(pictures),
         pictures_skipped=len(pictures.skipped),
@@ -118,7 +122,8 @@ def train_odometry(
     sequences = [sequence for folder in labels for sequence in read_labels(folder)]
     files.make_output_folder(output, "train odometry")
     _same_labels(output / LABEL_STORES, sequences)
-    architecture = replace(load_weights(start).architecture, stability=True)
+    parent_weights = load_weights(start)
+    architecture = replace(without_dead_channels(parent_weights).architecture, stability=True)
     network, parent = _started(architecture, settings.optimiser.seed, start)
     frames = [LabelledFrames(sequence, settings.longer_side, settings.landmarks) for sequence in sequences]
     rehearsed, sources = _rehearsal(pictures, settings, output, progress)
@@ -131,7 +136,8 @@ def train_odometry(
         )
     if not data:
         data = tuple(DataSource(name, "not stated") for name in (*(s.name for s in sequences), *sources))
-    card = _card(network.architecture, "odometry", settings, data, parent)
+    published = replace(parent_weights.architecture, stability=True)
+    card = _card(published, "odometry", settings, data, parent)
     card.training.update(
         stability_trained=True,
         sequences=len(sequences),
@@ -139,7 +145,8 @@ def train_odometry(
         stable=sum(sequence.record.stable for sequence in sequences),
         unstable=sum(sequence.record.unstable for sequence in sequences),
     )
-    return _run(VOAdaptationStage(network, settings), pairs, settings, output, replace(card, notes=""), progress)
+    stage = VOAdaptationStage(network, settings, pairs.stable_per_unstable)
+    return _run(stage, pairs, settings, output, replace(card, notes=""), progress)
 
 
 def _rehearsal(
@@ -183,7 +190,8 @@ def _run(
 
     def save(trainer: Trainer) -> None:
         row = json.loads((output / "metrics.jsonl").read_text().splitlines()[-1])
-        tensors = {name: value.cpu().numpy() for name, value in trainer.average.network.state_dict().items()}
+        live = {name: value.cpu().numpy() for name, value in trainer.average.network.state_dict().items()}
+        tensors = with_dead_channels(live, card.architecture)
         training = {**card.training, "steps": trainer.step, "seconds": round(trainer.seconds)}
         save_weights(output / WEIGHTS, tensors, replace(card, training=training, metrics=row))
 
@@ -199,11 +207,24 @@ def _saved_steps(path: Path) -> int:
     return int(load_weights(path).card.training["steps"]) if path.is_file() else -1
 
 
-def _network(name: str, seed: int, start: Path | None) -> tuple[SuperPoint, str]:
-    """A network without the stability head, which only VO adaptation can teach, and the name of its parent weights."""
+def _network(name: str, seed: int, start: Path | None, stem: int = 0) -> tuple[SuperPoint, str]:
+    """A network without the stability head, which only VO adaptation can teach, and the name of its parent weights.
+
+    Args:
+        stem: channels of the first four layers; 0 for as many as the parent uses, or the architecture has.
+    """
     if name not in ARCHITECTURES:
         raise ConfigError(f"architecture {name}: unknown; choose among {', '.join(ARCHITECTURES)}")
-    return _started(replace(ARCHITECTURES[name], stability=False), seed, start)
+    architecture = replace(ARCHITECTURES[name], stability=False)
+    if stem > min(architecture.encoder[:STEM_LAYERS]):
+        raise ConfigError(f"setting `stem_channels`: {name} has {min(architecture.encoder[:STEM_LAYERS])}, not {stem}")
+    if stem:
+        return _started(
+            replace(architecture, encoder=(stem,) * STEM_LAYERS + architecture.encoder[STEM_LAYERS:]), seed, start
+        )
+    if start and _widths(load_weights(start).architecture) == _widths(architecture):
+        architecture = replace(without_dead_channels(load_weights(start)).architecture, stability=False)
+    return _started(architecture, seed, start)
 
 
 def _started(architecture: Architecture, seed: int, start: Path | None) -> tuple[SuperPoint, str]:
@@ -212,7 +233,7 @@ def _started(architecture: Architecture, seed: int, start: Path | None) -> tuple
     network = SuperPoint(architecture)
     if start is None:
         return network, ""
-    weights = load_weights(start)
+    weights = without_dead_channels(load_weights(start))
     heads = ("encoder", "detector", "descriptor", *(("stability",) if architecture.stability else ()))
     own = {key: value for key, value in weights.tensors.items() if key.partition(".")[0] in heads}
     if _widths(weights.architecture) != _widths(network.architecture):

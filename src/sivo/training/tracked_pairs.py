@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -66,6 +66,8 @@ class TrackedPairs:
         # as with pictures: long recordings do not drown short ones
         self._cumulative = np.cumsum(np.sqrt([len(useful) for useful in self.useful]))
         self.share = Share.of_this_process()
+        taught = np.array([frames.taught_stability() for frames in sequences]).sum(axis=0)
+        self.stable_per_unstable = float(taught[0] / max(taught[1], 1))
 
     def __len__(self) -> int:
         return self.settings.optimiser.steps
@@ -139,7 +141,7 @@ class TrackedPairs:
         cells = label_cells(points, agreement, visible, width, height, AdaptationSettings())
         if not settings.pairs.untracked_is_background:
             cells[cells == DUSTBIN] = IGNORED
-        return TrackedView(image, cells, FramePoints(points, known.landmark, known.stability), H)
+        return TrackedView(image, cells, replace(known, points=points), H)
 
     def _two_frames(
         self, rng: np.random.Generator, a: TrackedView, b: TrackedView, rows_a: Int64, rows_b: Int64
@@ -181,7 +183,7 @@ class TrackedPairs:
         count = self.settings.pairs.stability_points
         points, codes = np.zeros((count, 2), np.float32), np.full(count, IGNORED, np.int64)
         known = view.known
-        labelled = inside(known.points, self.settings.views.width, self.settings.views.height)
+        labelled = inside(known.points, self.settings.views.width, self.settings.views.height) & known.seen
         unstable = rng.permutation(np.flatnonzero(labelled & (known.stability == UNSTABLE)))[: count // 2]
         stable = rng.permutation(np.flatnonzero(labelled & (known.stability == STABLE)))
         rows = np.concatenate([unstable, stable])[:count]
@@ -192,7 +194,7 @@ class TrackedPairs:
 
 def _unlabelled(view: View) -> TrackedView:
     """A view of a picture of which no stability is known."""
-    nothing = FramePoints(np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int8))
+    nothing = FramePoints(np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int8), np.zeros(0, np.bool_))
     return TrackedView(view.image, view.cells, nothing, view.view_from_picture)
 
 

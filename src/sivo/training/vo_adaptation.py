@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from sivo.errors import ConfigError
 from sivo.frontend.superpoint import SuperPoint, sample_descriptors, sample_stability
 from sivo.training.losses import detector_loss, info_nce_loss, stability_loss
 from sivo.training.settings import OdometryTrainingSettings
@@ -14,17 +15,36 @@ from sivo.training.trainer import Stage
 
 
 class VOAdaptationStage(Stage):
-    """All three heads on both views of a pair; what the odometry does not know counts for nothing."""
+    """All three heads on both views of a pair; what the odometry does not know counts for nothing.
 
-    def __init__(self, network: SuperPoint, settings: OdometryTrainingSettings) -> None:
+    Args:
+        stable_per_unstable: see `stability_loss`.
+    """
+
+    def __init__(self, network: SuperPoint, settings: OdometryTrainingSettings, stable_per_unstable: float) -> None:
         super().__init__()
         self.network = network
         self.settings = settings
+        self.stable_per_unstable = stable_per_unstable
         self.log_scale = nn.Parameter(torch.tensor(math.log(20.0)))  # inverse temperature of the InfoNCE loss
+        if settings.stability_alone:
+            self.requires_grad_(False)
+            self._head.requires_grad_(True)
+
+    def train(self, mode: bool = True) -> VOAdaptationStage:
+        """As in torch; what is not trained keeps its batch norm's statistics too."""
+        super().train(mode)
+        if self.settings.stability_alone:
+            self.network.eval()
+            self._head.train(mode)
+        return self
 
     def losses(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """See `Stage`; `batch` is that of `TrackedPairs`."""
         settings = self.settings
+        if settings.stability_alone:
+            loss = self._stability(self._head(self.network.encode(batch["images"])), batch)
+            return {"loss": loss, "stability": loss}
         output = self.network(batch["images"])
         detector = detector_loss(output.detector_logits, batch["cells"], settings.detector)
         with torch.autocast(output.descriptors.device.type, enabled=False):
@@ -35,8 +55,7 @@ class VOAdaptationStage(Stage):
                 a, b, points_a, points_b, batch["valid"], self.log_scale.exp().clamp(max=100), settings.masked_pixels,
                 negative=batch["negative"],
             )  # fmt: skip
-            logits = sample_stability(output.stability_logits.float(), batch["stability_points"])
-            stability = stability_loss(logits, batch["stability"])
+        stability = self._stability(output.stability_logits, batch)
         total = settings.detector_weight * detector + settings.descriptor_weight * descriptor
         return {
             "loss": total + settings.stability_weight * stability,
@@ -45,3 +64,14 @@ class VOAdaptationStage(Stage):
             "stability": stability,
             "correspondences": batch["valid"].sum(dim=1).float().mean(),
         }
+
+    def _stability(self, logits: Tensor, batch: dict[str, Tensor]) -> Tensor:
+        with torch.autocast(logits.device.type, enabled=False):
+            sampled = sample_stability(logits.float(), batch["stability_points"])
+            return stability_loss(sampled, batch["stability"], self.stable_per_unstable)
+
+    @property
+    def _head(self) -> nn.Sequential:
+        if self.network.stability is None:
+            raise ConfigError("VO adaptation needs a network with a stability head")
+        return self.network.stability
