@@ -32,9 +32,16 @@ def camera_x(frame: int) -> float:
 
 
 def write_labelled_scene(
-    folder: Path, name: str = "walls", keypoint_noise: float = 0.0, unstable_error: float = 4.0
+    folder: Path,
+    name: str = "walls",
+    keypoint_noise: float = 0.0,
+    unstable_error: float = 4.0,
+    wrong_link: bool = False,
 ) -> Path:
-    """A label store with one finished, packed sequence of `FRAMES` frames; returns the store."""
+    """A label store with one finished, packed sequence of `FRAMES` frames; returns the store.
+
+    Unstable dots glide along their wall as the frames go by; with `wrong_link` their tracks jump once instead.
+    """
     rng = np.random.default_rng(0)
     xyz = scene_points()
     store = LabelStore(folder, {"sequence": to_dict(SequenceSettings()), "labels": to_dict(LabelSettings())})
@@ -58,15 +65,20 @@ def write_labelled_scene(
     observations = np.array([count for _, _, count in tracks])
     unstable = xyz[owner, 0] > UNSTABLE_FROM
     stability = np.where(observations < 10, IGNORE, np.where(unstable, UNSTABLE, STABLE)).astype(np.int8)
+    estimated = xyz[owner]
+    if not wrong_link:  # a point that moves with the camera looks like one that is farther away
+        estimated[unstable] *= 1.5
     with TracksWriter(partial / TRACKS_FILE) as writer:
         places = table[:, 2:] + keypoint_noise * rng.uniform(-1, 1, (len(table), 2))
+        if wrong_link:
+            places[unstable[table[:, 1].astype(int)] & (table[:, 0] >= HALF), 1] += 9.0
         ones = np.ones(len(table))
         errors = np.where(unstable[table[:, 1].astype(int)], unstable_error, 0.5)
         writer.write(table[:, 0].astype(int), table[:, 1].astype(int), places, ones, errors)
     with PointsWriter(partial / POINTS_FILE) as writer:
         writer.write(
             PointsTable(
-                track=np.arange(len(tracks)), point=np.where(unstable, -1, owner), xyz=xyz[owner],
+                track=np.arange(len(tracks)), point=np.where(unstable, -1, owner), xyz=estimated,
                 observations=observations, mean_error=np.where(unstable, 4.0, 0.5).astype(np.float32),
                 max_error=np.where(unstable, 9.0, 1.0).astype(np.float32), stability=stability,
                 segment=np.zeros(len(tracks), np.int64), parallax_deg=np.full(len(tracks), 5.0, np.float32),

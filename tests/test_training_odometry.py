@@ -43,7 +43,9 @@ from sivo.training.stages import loaded  # noqa: E402
 from sivo.training.tracked_pairs import TrackedPairs  # noqa: E402
 
 TINY = Architecture("tiny", encoder=(4, 4, 4, 4, 8, 8, 8, 8), head=8, descriptor=8, stability=False)
-PAPER = LandmarkSettings(shared=False, unseen=False, reprojected=False, unstable_median_error=0.0)
+PAPER = LandmarkSettings(
+    shared=False, unseen=False, reprojected=False, unstable_median_error=0.0, unstable_largest_step=1.0
+)
 TRACKS_ONLY = LandmarkSettings(unseen=False, reprojected=False)
 LATE = HALF + 20  # a frame in which no track follows the odd far points any more
 
@@ -120,6 +122,25 @@ def test_an_unstable_label_of_one_wrong_link_does_not_teach(tmp_path: Path) -> N
     published, sure = (frames_of(jumps, s).points(5).stability for s in (PAPER, LandmarkSettings(unseen=False)))
     assert (published == UNSTABLE).sum() > 20
     assert not (sure == UNSTABLE).any()
+
+
+def test_a_thing_that_moves_teaches_and_a_track_that_jumps_once_does_not(tmp_path: Path) -> None:
+    moves = write_labelled_scene(tmp_path / "moves")
+    jumps = write_labelled_scene(tmp_path / "jumps", wrong_link=True)
+    everything = LandmarkSettings(unseen=False, unstable_largest_step=1.0)
+    for store, taught in ((moves, True), (jumps, False)):
+        labelled = (frames_of(store, everything).points(5).stability == UNSTABLE).sum()
+        sure = (frames_of(store, LandmarkSettings(unseen=False)).points(5).stability == UNSTABLE).sum()
+        assert labelled > 20
+        assert sure == (labelled if taught else 0)
+
+
+def test_stability_is_taught_only_where_a_track_saw_the_point(store: Path) -> None:
+    known = frames_of(store, LandmarkSettings()).points(LATE)
+    assert (~known.seen & (known.stability == STABLE)).sum() > 30
+    observed = frames_of(store, TRACKS_ONLY).points(LATE)
+    assert observed.seen.all()
+    assert distances(known.points[known.seen], observed.points).max() < 2.1
 
 
 def settings_of(**changes: Any) -> OdometryTrainingSettings:

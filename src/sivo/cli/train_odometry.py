@@ -21,6 +21,7 @@ PAPER = [
     "landmarks.unseen=false",
     "landmarks.reprojected=false",
     "landmarks.unstable_median_error=0",
+    "landmarks.unstable_largest_step=1",
 ]
 
 

@@ -17,6 +17,7 @@ from sivo.labeling.grouping import medians, rows_of
 from sivo.labeling.labelled import LabelledSequence
 from sivo.labeling.stability import IGNORE, STABLE, UNSTABLE
 from sivo.training.settings import LandmarkSettings
+from sivo.training.wrong_links import largest_step_shares
 from sivo.types import Float32, Float64, Int64, UInt8
 
 Codes = NDArray[np.int8]
@@ -98,9 +99,10 @@ class LabelledFrames:
         track_of_row = rows_of(points.track, table.track)
         track = track_of_row[order]
         landmark_of_track, stability = self._landmarks_of_tracks()
-        if self.settings.unstable_median_error > 0:
-            unsure = medians(track_of_row, table.error, len(points)) < self.settings.unstable_median_error
-            stability = np.where((stability == UNSTABLE) & unsure, IGNORE, stability).astype(np.int8)
+        unsure = medians(track_of_row, table.error, len(points)) < self.settings.unstable_median_error
+        if self.settings.unstable_largest_step < 1:
+            unsure |= ~(largest_step_shares(self.sequence) <= self.settings.unstable_largest_step)
+        stability = np.where((stability == UNSTABLE) & unsure, IGNORE, stability).astype(np.int8)
         _, representative, landmark_of_track = np.unique(landmark_of_track, return_index=True, return_inverse=True)
         self._landmark: Int64 = landmark_of_track[track]
         self._stability: Codes = stability[representative]

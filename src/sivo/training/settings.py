@@ -125,7 +125,10 @@ class LandmarkSettings:
     reprojected: bool = True  # a stable point lies at its projection, not at the keypoint; False is the paper
     # pixels; an unstable track whose median error is smaller has a wrong link or two, which say nothing on the place it
     # shows, and is not taught as unstable; 0 is the paper
-    unstable_median_error: float = 2.0
+    unstable_median_error: float = 1.0
+    # an unstable track is not taught either if one link makes more than this share of the way that its error goes
+    # (`sivo.training.wrong_links`); 1 is the paper
+    unstable_largest_step: float = 0.25
     largest_correction: float = 2.0  # pixels of the recording between the two; beyond it the keypoint holds
     largest_view_angle_degrees: float = 40.0  # from the mean direction in which an unseen point was seen
     largest_distance_ratio: float = 1.7  # to its mean distance, in either direction
