@@ -32,6 +32,8 @@ class StartSettings:
     max_waiting: int = 300  # frames kept while waiting for enough parallax
     epipolar_error: float = 1.0  # pixels, RANSAC threshold of the essential matrix and of the homography
     max_homography_ratio: float = 0.7  # homography inliers / essential inliers; more is too little parallax
+    # points of the essential matrix that the homography leaves; so many show parallax whatever the ratio is
+    min_off_plane_points: int = 60
     plane_ratio: float = 0.95  # from here on the scene is a plane, and its homography is decomposed
     min_parallax_deg: float = 1.0
     min_points: int = 30  # over the minimum parallax

@@ -45,7 +45,7 @@ def two_view_geometry(
     """Relative pose of two views by the five-point algorithm, gated by a rotation and by a homography.
 
     Where a pure rotation explains the matches, or a homography does about as well as an essential matrix, the
-    translation and with it all depths would be noise.
+    translation and with it all depths would be noise; unless enough points contradict the homography, as before a wall.
     """
     matches = match_units(a.descriptors, b.descriptors, descriptor_distance)
     rows_a, rows_b = matches[:, 0], matches[:, 1]
@@ -70,7 +70,8 @@ def two_view_geometry(
     ratio = np.sum(planar["inliers"]) / max(inliers.sum(), 1)
     if ratio >= settings.plane_ratio:
         return _from_plane(a, b, rows_a, rows_b, homography, np.asarray(planar["inliers"], bool), camera, settings)
-    if ratio > settings.max_homography_ratio:
+    off_plane = (inliers & ~np.asarray(planar["inliers"], bool)).sum()
+    if ratio > settings.max_homography_ratio and off_plane < settings.min_off_plane_points:
         return Refusal("too little parallax")
     return _points_of(a, b, rows_a[inliers], rows_b[inliers], se3.rigid(pose.R, pose.t), camera, settings)
 
