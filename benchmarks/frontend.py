@@ -116,7 +116,7 @@ def measure(weights: Weights, name: str, frames: tuple[UInt8, UInt8], arguments:
     """Median milliseconds of everything on one image size."""
     previous, image = frames
     height, width = image.shape
-    calibrated = weights if weights.card.activation_ranges else calibrate(weights, frames)
+    calibrated = without_dead_channels(weights if weights.card.activation_ranges else calibrate(weights, frames))
 
     def frontend(**settings: Any) -> NetworkFrontend:
         chosen = NetworkSettings(max_keypoints=KEYPOINTS, threshold=0.0, threads=arguments.threads, **settings)
@@ -143,7 +143,7 @@ def measure(weights: Weights, name: str, frames: tuple[UInt8, UInt8], arguments:
         **onnx_contenders(calibrated, batch, arguments.threads),
     }
     milliseconds = median_milliseconds(timed, arguments.rounds, CLOCKS[arguments.clock])
-    operations = 2 * without_dead_channels(weights).architecture.multiplications(height, width)
+    operations = 2 * calibrated.architecture.multiplications(height, width)
     return {
         "weights": name,
         "size": [width, height],

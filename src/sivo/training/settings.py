@@ -150,6 +150,8 @@ class PairSettings:
     stability_points: int = 200  # labelled points taught per view, at most; as many unstable ones as there are
     # a cell in which no keypoint was ever followed to a neighbouring frame is taught to have none; False ignores it
     untracked_is_background: bool = True
+    # False: labelled frames teach descriptors and stability, and the detector learns from what is rehearsed alone
+    teach_detector: bool = True
 
 
 @dataclass(frozen=True)

@@ -139,6 +139,8 @@ class TrackedPairs:
         # unstable and unknown points: the detector may see them as it likes
         agreement = np.where(known.stability == STABLE, _CERTAIN, _UNDECIDED).astype(np.float32)
         cells = label_cells(points, agreement, visible, width, height, AdaptationSettings())
+        if not settings.pairs.teach_detector:
+            cells[:] = IGNORED
         if not settings.pairs.untracked_is_background:
             cells[cells == DUSTBIN] = IGNORED
         return TrackedView(image, cells, replace(known, points=points), H)
