@@ -34,7 +34,7 @@ class StartSettings:
     max_homography_ratio: float = 0.7  # homography inliers / essential inliers; more is too little parallax
     # points of the essential matrix that the homography leaves; so many show parallax whatever the ratio is
     min_off_plane_points: int = 60
-    plane_ratio: float = 0.95  # from here on the scene is a plane, and its homography is decomposed
+    plane_ratio: float = 0.8  # from here on the scene is mostly a plane, and its homography is decomposed
     min_parallax_deg: float = 1.0
     min_points: int = 30  # over the minimum parallax
     min_inlier_share: float = 0.3  # essential inliers of the matches

@@ -68,11 +68,11 @@ def two_view_geometry(
     if np.median(rotation_residuals(camera, pixels_a[inliers], pixels_b[inliers])) < settings.min_rotation_residual:
         return Refusal("too little parallax: a rotation explains the motion")
     ratio = np.sum(planar["inliers"]) / max(inliers.sum(), 1)
-    if ratio >= settings.plane_ratio:
-        return _from_plane(a, b, rows_a, rows_b, homography, np.asarray(planar["inliers"], bool), camera, settings)
-    off_plane = (inliers & ~np.asarray(planar["inliers"], bool)).sum()
-    if ratio > settings.max_homography_ratio and off_plane < settings.min_off_plane_points:
-        return Refusal("too little parallax")
+    on_plane = np.asarray(planar["inliers"], bool)
+    if ratio > settings.max_homography_ratio and (inliers & ~on_plane).sum() < settings.min_off_plane_points:
+        if ratio < settings.plane_ratio:
+            return Refusal("too little parallax")
+        return _from_plane(a, b, rows_a, rows_b, homography, on_plane, camera, settings)
     return _points_of(a, b, rows_a[inliers], rows_b[inliers], se3.rigid(pose.R, pose.t), camera, settings)
 
 
