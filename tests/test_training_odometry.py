@@ -293,3 +293,29 @@ def test_frames_that_are_useful_have_stable_points(store: Path) -> None:
     assert len(frames) == FRAMES
     assert len(frames.useful_frames(16)) == FRAMES
     assert len(frames.useful_frames(100000)) == 0
+
+
+def test_the_stability_head_can_be_trained_alone(store: Path, tiny_weights: Path, tmp_path: Path) -> None:
+    from sivo.config import to_yaml
+
+    config = tmp_path / "settings.yaml"
+    config.write_text(to_yaml(settings_of(stability_alone=True)))
+    command = ["train", "odometry", str(store), "-o", str(tmp_path / "out"), "--from", str(tiny_weights)]
+    assert main([*command, "--config", str(config)]) == 0
+    rows = [json.loads(row) for row in (tmp_path / "out" / "metrics.jsonl").read_text().splitlines()]
+    assert rows[-1]["stability"] < rows[0]["stability"]
+    before, after = load_weights(tiny_weights), load_weights(tmp_path / "out" / "weights.safetensors")
+    assert after.architecture.stability
+    for name, values in before.tensors.items():
+        assert np.array_equal(after.tensors[name], values), name
+
+
+def test_a_detector_can_be_left_to_rehearsal(store: Path) -> None:
+    frames = [frames_of(store, LandmarkSettings())]
+    taught, left = (
+        TrackedPairs(frames, settings_of(pairs=PairSettings(points=48, stability_points=60, teach_detector=teach)))[0]
+        for teach in (True, False)
+    )
+    assert (taught["cells"] != IGNORED).any()
+    assert (left["cells"] == IGNORED).all()
+    assert np.array_equal(taught["points_a"], left["points_a"])
