@@ -8,7 +8,7 @@ it was stopped. Three trainings, all of them `sivo train homographies`:
 2. small again: the learning rate falls to zero. This is `superpoint-small`.
 3. full: the small network widened behind its first four layers, which computes the same, and trained on. The first four
    keep the 32 channels of the small one and leave the paper's other 32 at zero: at full and half resolution they would
-   cost two thirds of all time, in training and after. This is `superpoint`.
+   cost three fifths of all time, in training and after. This is `superpoint`.
 
 With --round, the pictures are labelled anew by the network of step 2 before step 3 (homographic adaptation proper).
 """
