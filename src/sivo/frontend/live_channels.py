@@ -1,7 +1,7 @@
 """Channels that are always zero: left out where a network runs or is trained, put back where its weights are kept.
 
-The first layers work on the most pixels: in `superpoint` at 640×480 the four of them, 64 channels wide, take three fifths
-of all multiplications. Weights may leave some of those channels unused, their filters, biases and batch norm all zero.
+The first layers work on the most pixels: in `superpoint` the first four, 64 channels wide, take three fifths of all
+multiplications. Weights may leave some of those channels unused, their filters, biases and batch norm all zero.
 The file then still has the paper's shapes and computes what any other program makes of it; without them it computes the
 same in less time. Training keeps them at zero by itself: nothing passes a ReLU at zero in either direction.
 """
