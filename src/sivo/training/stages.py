@@ -46,8 +46,7 @@ def train_shapes(
 ) -> dict[str, Any]:
     """Stage 1: a detector from drawn shapes alone; returns the last row of metrics."""
     network, parent = _network(settings.architecture, settings.optimiser.seed, start)
-    published = replace(ARCHITECTURES[settings.architecture], stability=False)
-    card = _card(published, "shapes", settings, (SHAPES,), parent)
+    card = _card(_published(settings.architecture), "shapes", settings, (SHAPES,), parent)
     return _run(MagicPointStage(network, settings.detector), ShapeBatches(settings), settings, output, card, progress)
 
 
@@ -83,8 +82,7 @@ def train_homographies(
         source, drawn = shape_source(settings.shapes, settings.optimiser.seed, weight)
         pictures = replace(pictures, sources=(*pictures.sources, source))
         labels, data = [*labels, drawn], (*data, SHAPES)
-    published = replace(ARCHITECTURES[settings.architecture], stability=False)
-    card = _card(published, "homographies", settings, data, parent)
+    card = _card(_published(settings.architecture), "homographies", settings, data, parent)
     card.training.update(
         detector_labels=str(detector.name) if detector else "shi-tomasi", pictures=len(pictures),
         pictures_skipped=len(pictures.skipped),
@@ -122,9 +120,9 @@ def train_odometry(
     sequences = [sequence for folder in labels for sequence in read_labels(folder)]
     files.make_output_folder(output, "train odometry")
     _same_labels(output / LABEL_STORES, sequences)
-    parent_weights = load_weights(start)
-    architecture = replace(without_dead_channels(parent_weights).architecture, stability=True)
-    network, parent = _started(architecture, settings.optimiser.seed, start)
+    parent = load_weights(start)
+    architecture = replace(without_dead_channels(parent).architecture, stability=True)
+    network = _started(architecture, settings.optimiser.seed, parent)
     frames = [LabelledFrames(sequence, settings.longer_side, settings.landmarks) for sequence in sequences]
     rehearsed, sources = _rehearsal(pictures, settings, output, progress)
     pairs = TrackedPairs(frames, settings, rehearsed)
@@ -136,8 +134,8 @@ def train_odometry(
         )
     if not data:
         data = tuple(DataSource(name, "not stated") for name in (*(s.name for s in sequences), *sources))
-    published = replace(parent_weights.architecture, stability=True)
-    card = _card(published, "odometry", settings, data, parent)
+    published = replace(parent.architecture, stability=True)
+    card = _card(published, "odometry", settings, data, start.name)
     card.training.update(
         stability_trained=True,
         sequences=len(sequences),
@@ -213,33 +211,37 @@ def _network(name: str, seed: int, start: Path | None, stem: int = 0) -> tuple[S
     Args:
         stem: channels of the first four layers; 0 for as many as the parent uses, or the architecture has.
     """
-    if name not in ARCHITECTURES:
-        raise ConfigError(f"architecture {name}: unknown; choose among {', '.join(ARCHITECTURES)}")
-    architecture = replace(ARCHITECTURES[name], stability=False)
+    architecture = _published(name)
+    weights = load_weights(start) if start else None
     if stem > min(architecture.encoder[:STEM_LAYERS]):
         raise ConfigError(f"setting `stem_channels`: {name} has {min(architecture.encoder[:STEM_LAYERS])}, not {stem}")
     if stem:
-        return _started(
-            replace(architecture, encoder=(stem,) * STEM_LAYERS + architecture.encoder[STEM_LAYERS:]), seed, start
-        )
-    if start and _widths(load_weights(start).architecture) == _widths(architecture):
-        architecture = replace(without_dead_channels(load_weights(start)).architecture, stability=False)
-    return _started(architecture, seed, start)
+        architecture = replace(architecture, encoder=(stem,) * STEM_LAYERS + architecture.encoder[STEM_LAYERS:])
+    elif weights and _widths(weights.architecture) == _widths(architecture):
+        architecture = replace(without_dead_channels(weights).architecture, stability=False)
+    return _started(architecture, seed, weights), start.name if start else ""
 
 
-def _started(architecture: Architecture, seed: int, start: Path | None) -> tuple[SuperPoint, str]:
+def _published(name: str) -> Architecture:
+    """What a named network is saved as, whatever channels of it are used; VO adaptation adds the stability head."""
+    if name not in ARCHITECTURES:
+        raise ConfigError(f"architecture {name}: unknown; choose among {', '.join(ARCHITECTURES)}")
+    return replace(ARCHITECTURES[name], stability=False)
+
+
+def _started(architecture: Architecture, seed: int, weights: Weights | None) -> SuperPoint:
     """A network with the given weights, widened where it is wider; what they lack stays random."""
     torch.manual_seed(seed)
     network = SuperPoint(architecture)
-    if start is None:
-        return network, ""
-    weights = without_dead_channels(load_weights(start))
+    if weights is None:
+        return network
+    weights = without_dead_channels(weights)
     heads = ("encoder", "detector", "descriptor", *(("stability",) if architecture.stability else ()))
     own = {key: value for key, value in weights.tensors.items() if key.partition(".")[0] in heads}
     if _widths(weights.architecture) != _widths(network.architecture):
         own = widen(own, weights.architecture, network.architecture, np.random.default_rng(seed))
     network.load_state_dict({key: torch.from_numpy(value) for key, value in own.items()}, strict=False)
-    return network, start.name
+    return network
 
 
 def _widths(architecture: Architecture) -> Architecture:

@@ -13,23 +13,24 @@ import numpy as np
 from sivo.geometry.se3 import transform
 from sivo.labeling.grouping import rows_of
 from sivo.labeling.labelled import LabelledSequence
+from sivo.labeling.stability import UNSTABLE
 from sivo.types import Float64
 
 
 def largest_step_shares(sequence: LabelledSequence) -> Float64:
-    """Of every track, its largest step as a share of the way (T,); NaN for tracks without a 3D point or of one frame.
+    """Of every unstable track, its largest step as a share of the way (T,); NaN for all others.
 
     The way is the diagonal of the box about all of the track's error vectors.
     """
     tracks, points = sequence.tracks, sequence.points
     row = rows_of(points.track, tracks.track)
-    order = np.lexsort((tracks.frame, row))
+    wanted = np.flatnonzero(points.stability[row] == UNSTABLE)  # few of all, and a pose for each of them is gathered
+    order = wanted[np.lexsort((tracks.frame[wanted], row[wanted]))]
     row, frame = row[order], tracks.frame[order].astype(np.int64)
     xyz = points.xyz[row].astype(np.float64)
     in_camera = transform(sequence.cam_from_world[frame], xyz[:, None])[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        projected = (in_camera @ sequence.camera.K.T)[:, :2] / in_camera[:, 2:]
-    error = tracks.keypoints[order] - projected  # (M, 2)
+        error = tracks.keypoints[order] - sequence.camera.project(in_camera)  # (M, 2)
     known = np.isfinite(error).all(axis=1) & (in_camera[:, 2] > 0)
     row, frame, error = row[known], frame[known], error[known]
     low, high = np.full((2, len(points), 2), np.inf)
@@ -40,4 +41,5 @@ def largest_step_shares(sequence: LabelledSequence) -> Float64:
     step = np.zeros(len(points))
     np.maximum.at(step, row[1:][linked], np.linalg.norm(np.diff(error, axis=0)[linked], axis=1))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(step / np.linalg.norm(high - low, axis=1))
+        way = np.linalg.norm(high - low, axis=1)
+        return np.where(np.isfinite(way), step / way, np.nan)
