@@ -7,7 +7,7 @@ from simulated_features import CAMERA, hand_motion, observe, room
 
 from sivo.geometry import se3
 from sivo.odometry.health import HealthCheck, epipolar_errors
-from sivo.odometry.settings import HealthSettings
+from sivo.odometry.settings import OdometrySettings
 from sivo.odometry.view import View
 from sivo.tracking.matching import unit_descriptors
 from sivo.types import Float64
@@ -16,7 +16,7 @@ from sivo.types import Float64
 def alarms(estimate: Float64, truth: Float64) -> list[int]:
     """Positions at which the check speaks, for views of `truth` that the map believes to be at `estimate`."""
     world = room()
-    check = HealthCheck(CAMERA, HealthSettings(), descriptor_distance=0.7, seed=0)
+    check = HealthCheck(CAMERA, OdometrySettings(), descriptor_distance=0.7)
     earlier: dict[int, View] = {}
     said = []
     for position, (believed, true) in enumerate(zip(estimate, truth, strict=True)):

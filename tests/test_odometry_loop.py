@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from simulated_features import CAMERA, hand_motion, nothing_to_see, observe, room
 
+from sivo.geometry import se3
 from sivo.geometry.alignment import align_points
 from sivo.odometry.journal import FinalView
-from sivo.odometry.settings import OdometrySettings
+from sivo.odometry.settings import OdometrySettings, TrustSettings
 from sivo.odometry.view import View
 from sivo.odometry.visual_odometry import VisualOdometry
 from sivo.types import Features, Float64
@@ -173,6 +174,33 @@ def test_frames_without_any_keypoint_are_lost_not_fatal(walk: tuple[Float64, lis
     lost = np.flatnonzero(~odometry.trajectory.valid).tolist()
     assert 41 in lost
     assert odometry.trajectory.valid.sum() >= 58
+
+
+def test_a_crowd_that_fills_the_picture_does_not_become_the_world_where_stability_is_known() -> None:
+    truth = hand_motion(60)
+    sway = 0.4 * np.sin(np.arange(60) / 10.0)
+    away = se3.rigid(np.eye(3), np.stack([0 * sway, sway, 0 * sway], axis=1))  # how the crowd moves
+    static = [observe(room(0), pose, seed=i, limit=200) for i, pose in enumerate(truth)]
+    crowd = [observe(room(1), pose, seed=100 + i, limit=300) for i, pose in enumerate(se3.inverse(away) @ truth)]
+    features = [_together(a, b, (0.9, 0.1)) for a, b in zip(static, crowd, strict=True)]
+
+    def error(settings: OdometrySettings) -> float:
+        trajectory = track(features, settings)[0].trajectory
+        assert trajectory.valid.all()
+        return error_percent(trajectory.positions, truth[:, :3, 3])
+
+    assert error(OdometrySettings()) < 1.0
+    assert error(OdometrySettings(trust=TrustSettings(least_stability=0.0))) > 5.0, "the weights alone are enough"
+
+
+def _together(first: Features, second: Features, stability: tuple[float, float]) -> Features:
+    """The features of both, each with its stability."""
+    known = np.repeat(np.float32(stability), (len(first), len(second)))
+    joined = {
+        name: np.concatenate([getattr(first, name), getattr(second, name)])
+        for name in ("keypoints", "descriptors", "scores")
+    }
+    return Features(**joined, stability=known)
 
 
 def test_memory_holds_no_more_views_than_the_window(walk: tuple[Float64, list[Features]]) -> None:

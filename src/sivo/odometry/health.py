@@ -16,9 +16,8 @@ import poselib
 from sivo.geometry import se3
 from sivo.geometry.camera import Camera
 from sivo.odometry.local_map import poselib_camera
-from sivo.odometry.settings import HealthSettings
-from sivo.odometry.view import View
-from sivo.tracking.matching import match_units
+from sivo.odometry.settings import OdometrySettings
+from sivo.odometry.view import View, trusted_matches
 from sivo.types import Float64, Int64
 
 _FEATURES = 600  # the strongest of each view; all of them would only cost time
@@ -40,12 +39,11 @@ class HealthCheck:
     inliers, a mirrored or otherwise wrong one at most 80 % (docs/odometry.md).
     """
 
-    def __init__(self, camera: Camera, settings: HealthSettings, descriptor_distance: float, seed: int) -> None:
+    def __init__(self, camera: Camera, settings: OdometrySettings, descriptor_distance: float) -> None:
         self._camera = camera
         self._settings = settings
         self._descriptor_distance = descriptor_distance
-        self._seed = seed
-        self._rounds: deque[Int64] = deque(maxlen=settings.rounds)  # of (gaps, 2) map and own inliers
+        self._rounds: deque[Int64] = deque(maxlen=settings.health.rounds)  # of (gaps, 2) map and own inliers
 
     def contradicts(self, view: View, earlier: Mapping[int, View]) -> bool:
         """Whether the last checks together say that the map is wrong.
@@ -54,7 +52,7 @@ class HealthCheck:
             view: the newest view with a pose.
             earlier: recent views with poses by position.
         """
-        settings = self._settings
+        settings = self._settings.health
         if view.position % settings.interval:
             return False
         counts = np.zeros((len(settings.gaps), 2), np.int64)
@@ -62,12 +60,7 @@ class HealthCheck:
             if view.position - gap not in earlier:
                 continue
             found = agreement(
-                earlier[view.position - gap],
-                view,
-                self._camera,
-                self._descriptor_distance,
-                settings.epipolar_error,
-                self._seed,
+                earlier[view.position - gap], view, self._camera, self._descriptor_distance, self._settings
             )
             if found.own_inliers >= max(settings.min_inliers, settings.min_inlier_share * found.matches):
                 counts[row] = found.map_inliers, found.own_inliers
@@ -79,28 +72,27 @@ class HealthCheck:
         return bool(enough and map_inliers < settings.min_agreement * own_inliers)
 
 
-def agreement(
-    a: View, b: View, camera: Camera, descriptor_distance: float, epipolar_error: float, seed: int
-) -> Agreement:
+def agreement(a: View, b: View, camera: Camera, descriptor_distance: float, settings: OdometrySettings) -> Agreement:
     """Match two views with poses afresh, and count."""
+    epipolar_error = settings.health.epipolar_error
     assert a.cam_from_world is not None
     assert b.cam_from_world is not None
-    matches = match_units(a.descriptors[:_FEATURES], b.descriptors[:_FEATURES], descriptor_distance)
-    if len(matches) < 8:
-        return Agreement(0, 0, len(matches))
-    pixels_a, pixels_b = a.keypoints[matches[:, 0]], b.keypoints[matches[:, 1]]
+    rows_a, rows_b = trusted_matches(a, b, descriptor_distance, settings.trust, _FEATURES)
+    if len(rows_a) < 8:
+        return Agreement(0, 0, len(rows_a))
+    pixels_a, pixels_b = a.keypoints[rows_a], b.keypoints[rows_b]
     shape = poselib_camera(camera)
     _, report = poselib.estimate_relative_pose(
         pixels_a,
         pixels_b,
         shape,
         shape,
-        {"max_epipolar_error": epipolar_error, "min_iterations": 100, "max_iterations": 1000, "seed": seed},
+        {"max_epipolar_error": epipolar_error, "min_iterations": 100, "max_iterations": 1000, "seed": settings.seed},
     )
     b_from_a = b.cam_from_world @ se3.inverse(a.cam_from_world)
     errors = epipolar_errors(b_from_a, camera, pixels_a, pixels_b)
     fits = int((errors < epipolar_error).sum())
-    return Agreement(fits, int(report["num_inliers"]), len(matches))
+    return Agreement(fits, int(report["num_inliers"]), len(rows_a))
 
 
 def epipolar_errors(b_from_a: Float64, camera: Camera, pixels_a: Float64, pixels_b: Float64) -> Float64:

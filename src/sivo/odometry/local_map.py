@@ -13,7 +13,7 @@ from sivo.geometry import se3
 from sivo.geometry.camera import Camera
 from sivo.odometry.refind import match_by_projection
 from sivo.odometry.settings import OdometrySettings
-from sivo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_points
+from sivo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_points, trusted
 from sivo.tracking.matching import match_units
 from sivo.types import Float32, Float64, Int64
 
@@ -73,16 +73,18 @@ class LocalMap:
         view.points[matches[:, 1]] = earlier.points[rows[matches[:, 0]]]
 
     def _solve_pose(self, view: View) -> tuple[int, float]:
-        """RANSAC PnP on the view's points; outliers lose their point."""
+        """RANSAC PnP on the trusted points; whatever does not fit the pose loses its point."""
         rows = view.observed
         if len(rows) < 4:
             return 0, 0.0
+        max_error = self._settings.window.max_error
+        used = trusted(view.weights[rows], self._settings.trust)
         pose, report = poselib.estimate_absolute_pose(
-            view.keypoints[rows],
-            self.store.xyz[view.points[rows]],
+            view.keypoints[rows[used]],
+            self.store.xyz[view.points[rows[used]]],
             poselib_camera(self.camera),
             {
-                "max_reproj_error": self._settings.window.max_error,
+                "max_reproj_error": max_error,
                 "min_iterations": 100,
                 "max_iterations": 2000,
                 "seed": self._settings.seed,
@@ -90,7 +92,13 @@ class LocalMap:
         )
         inliers = np.asarray(report["inliers"], bool)
         view.cam_from_world = se3.rigid(pose.R, pose.t)
-        view.points[rows[~inliers]] = NO_POINT
+        fits = np.zeros(len(rows), bool)
+        fits[used] = inliers
+        if not used.all():
+            doubtful = rows[~used]
+            pixels, visible = self.project(view.cam_from_world, self.store.xyz[view.points[doubtful]])
+            fits[~used] = visible & (np.linalg.norm(pixels - view.keypoints[doubtful], axis=1) <= max_error)
+        view.points[rows[~fits]] = NO_POINT
         return int(inliers.sum()), float(inliers.mean())
 
     def _find_lost_points(self, view: View) -> None:

@@ -32,7 +32,7 @@ class PaperMapper:
         self._journal = journal
         self._map: LocalMap | None = None
         self._window: list[View] = []
-        self._health = HealthCheck(camera, settings.health, descriptor_distance, settings.seed)
+        self._health = HealthCheck(camera, settings, descriptor_distance)
 
     @property
     def local_map(self) -> LocalMap | None:

@@ -32,7 +32,7 @@ class RobustMapper:
         self._last_keyframe: View | None = None
         self._patience = 0  # frames to wait before the next try to start
         self._refusals = 0  # costly ones since the last start
-        self._health = HealthCheck(camera, settings.health, descriptor_distance, settings.seed)
+        self._health = HealthCheck(camera, settings, descriptor_distance)
         self._young: list[View] = []  # all views of a map that may still be started anew; nothing of it is final
 
     def track(self, view: View) -> None:
@@ -217,7 +217,7 @@ class RobustMapper:
         self._journal.give_up([v for v in self._waiting if v.cam_from_world is None])
         self._waiting = []
         self._young = list(self._recent)
-        self._health = HealthCheck(self._camera, self._settings.health, self._descriptor_distance, self._settings.seed)
+        self._health = HealthCheck(self._camera, self._settings, self._descriptor_distance)
         for waiting_view in self._recent:
             self._choose_keyframe(waiting_view)
         self._slide()

@@ -82,6 +82,14 @@ class HealthSettings:
 
 
 @dataclass(frozen=True)
+class TrustSettings:
+    """Which keypoints a RANSAC may use, by their stability; a mover that fills its sample becomes the world."""
+
+    least_stability: float = 0.5  # of a keypoint, and of both ends of a match; 0 lets all in
+    enough: int = 50  # of them; where there are fewer, all are used, since a doubtful pose is better than none
+
+
+@dataclass(frozen=True)
 class OdometrySettings:
     """Settings of `VisualOdometry`."""
 
@@ -89,6 +97,7 @@ class OdometrySettings:
     seed: int = 0
     matching: MatchingSettings = field(default_factory=MatchingSettings)
     start: StartSettings = field(default_factory=StartSettings)
+    trust: TrustSettings = field(default_factory=TrustSettings)
     window: WindowSettings = field(default_factory=WindowSettings)
     loss: TrackingLossSettings = field(default_factory=TrackingLossSettings)
     health: HealthSettings = field(default_factory=HealthSettings)

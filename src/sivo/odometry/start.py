@@ -14,9 +14,8 @@ from sivo.geometry import se3
 from sivo.geometry.camera import Camera
 from sivo.odometry.local_map import LocalMap, poselib_camera
 from sivo.odometry.settings import OdometrySettings, StartSettings
-from sivo.odometry.view import NO_POINT, View, common_tracks
+from sivo.odometry.view import NO_POINT, View, common_tracks, trusted_matches
 from sivo.odometry.window import adjust
-from sivo.tracking.matching import match_units
 from sivo.types import Float64, Int64
 
 
@@ -40,15 +39,15 @@ class Refusal:
 
 
 def two_view_geometry(
-    a: View, b: View, camera: Camera, settings: StartSettings, descriptor_distance: float, seed: int
+    a: View, b: View, camera: Camera, odometry: OdometrySettings, descriptor_distance: float
 ) -> TwoView | Refusal:
     """Relative pose of two views by the five-point algorithm, gated by a rotation and by a homography.
 
     Where a pure rotation explains the matches, or a homography does about as well as an essential matrix, the
     translation and with it all depths would be noise; unless enough points contradict the homography, as before a wall.
     """
-    matches = match_units(a.descriptors, b.descriptors, descriptor_distance)
-    rows_a, rows_b = matches[:, 0], matches[:, 1]
+    settings = odometry.start
+    rows_a, rows_b = trusted_matches(a, b, descriptor_distance, odometry.trust)
     if len(rows_a) < settings.min_matches:
         return Refusal("too few matches")
     pixels_a, pixels_b = a.keypoints[rows_a], b.keypoints[rows_b]
@@ -57,7 +56,7 @@ def two_view_geometry(
         "max_reproj_error": settings.epipolar_error,
         "min_iterations": 200,
         "max_iterations": 5000,
-        "seed": seed,
+        "seed": odometry.seed,
     }
     shape = poselib_camera(camera)
     pose, essential = poselib.estimate_relative_pose(pixels_a, pixels_b, shape, shape, options)
@@ -156,7 +155,7 @@ def start_map(
     a = next((v for v in waiting[:-1] if len(common_tracks(v, b)[0]) >= start.min_common_tracks), None)
     if a is None:
         return Refusal("too few tracks")
-    pair = two_view_geometry(a, b, camera, start, descriptor_distance, settings.seed)
+    pair = two_view_geometry(a, b, camera, settings, descriptor_distance)
     if isinstance(pair, Refusal):
         return pair
     local_map = LocalMap(camera, settings, descriptor_distance)

@@ -7,9 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sivo.odometry.settings import TrustSettings
+from sivo.tracking.matching import match_units
 from sivo.types import Float32, Float64, Int64
 
 NO_POINT = -1
+Mask = NDArray[np.bool_]
 
 
 @dataclass(eq=False)
@@ -77,6 +80,25 @@ def common_tracks(a: View, b: View) -> tuple[Int64, Int64]:
     return rows_a.astype(np.int64), rows_b.astype(np.int64)
 
 
+def trusted_matches(
+    a: View, b: View, descriptor_distance: float, trust: TrustSettings, strongest: int | None = None
+) -> tuple[Int64, Int64]:
+    """Rows of `a` and of `b` that match by their descriptors alone, as far as both ends are trusted.
+
+    Args:
+        strongest: keypoints of each view that take part; None for all.
+    """
+    matches = match_units(a.descriptors[:strongest], b.descriptors[:strongest], descriptor_distance)
+    chosen = matches[trusted(np.minimum(a.weights[matches[:, 0]], b.weights[matches[:, 1]]), trust)]
+    return chosen[:, 0], chosen[:, 1]
+
+
+def trusted(weights: Float64, trust: TrustSettings) -> Mask:
+    """(N,) which of the weights w_ij are high enough for a RANSAC; all, where those would be too few."""
+    stable = weights >= trust.least_stability
+    return stable if stable.sum() >= trust.enough else np.ones(len(weights), bool)
+
+
 def inherit_points(view: View, neighbour: View) -> None:
     """Keypoints of `view` without a point take the point that their track has in `neighbour`."""
     rows, rows_neighbour = common_tracks(view, neighbour)
@@ -92,6 +114,3 @@ def _keep_first_of_each_point(view: View) -> None:
     duplicates = np.ones(len(rows), bool)
     duplicates[first] = False
     view.points[rows[duplicates]] = NO_POINT
-
-
-Mask = NDArray[np.bool_]
