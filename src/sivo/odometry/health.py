@@ -17,7 +17,8 @@ from sivo.geometry import se3
 from sivo.geometry.camera import Camera
 from sivo.odometry.local_map import poselib_camera
 from sivo.odometry.settings import OdometrySettings
-from sivo.odometry.view import View, trusted_matches
+from sivo.odometry.view import View, trusted_pairs
+from sivo.tracking.matching import match_units
 from sivo.types import Float64, Int64
 
 _FEATURES = 600  # the strongest of each view; all of them would only cost time
@@ -73,26 +74,33 @@ class HealthCheck:
 
 
 def agreement(a: View, b: View, camera: Camera, descriptor_distance: float, settings: OdometrySettings) -> Agreement:
-    """Match two views with poses afresh, and count."""
-    epipolar_error = settings.health.epipolar_error
+    """Match two views with poses afresh, and count.
+
+    The two views' own geometry comes from trusted matches, or a crowd's motion would pass for it; all matches are
+    counted, or too few would be left to say that a map is wrong.
+    """
     assert a.cam_from_world is not None
     assert b.cam_from_world is not None
-    rows_a, rows_b = trusted_matches(a, b, descriptor_distance, settings.trust, _FEATURES)
-    if len(rows_a) < 8:
-        return Agreement(0, 0, len(rows_a))
-    pixels_a, pixels_b = a.keypoints[rows_a], b.keypoints[rows_b]
+    matches = match_units(a.descriptors[:_FEATURES], b.descriptors[:_FEATURES], descriptor_distance)
+    if len(matches) < 8:
+        return Agreement(0, 0, len(matches))
+    pixels_a, pixels_b = a.keypoints[matches[:, 0]], b.keypoints[matches[:, 1]]
+    used = trusted_pairs(a, b, matches, settings.trust)
+    limit = settings.health.epipolar_error
     shape = poselib_camera(camera)
-    _, report = poselib.estimate_relative_pose(
-        pixels_a,
-        pixels_b,
+    own, report = poselib.estimate_relative_pose(
+        pixels_a[used],
+        pixels_b[used],
         shape,
         shape,
-        {"max_epipolar_error": epipolar_error, "min_iterations": 100, "max_iterations": 1000, "seed": settings.seed},
+        {"max_epipolar_error": limit, "min_iterations": 100, "max_iterations": 1000, "seed": settings.seed},
     )
-    b_from_a = b.cam_from_world @ se3.inverse(a.cam_from_world)
-    errors = epipolar_errors(b_from_a, camera, pixels_a, pixels_b)
-    fits = int((errors < epipolar_error).sum())
-    return Agreement(fits, int(report["num_inliers"]), len(rows_a))
+    of_map = b.cam_from_world @ se3.inverse(a.cam_from_world)
+    fits_map, fits_own = (
+        epipolar_errors(b_from_a, camera, pixels_a, pixels_b) < limit for b_from_a in (of_map, se3.rigid(own.R, own.t))
+    )
+    fits_own[used] = report["inliers"]  # which also lie in front of both
+    return Agreement(int(fits_map.sum()), int(fits_own.sum()), len(matches))
 
 
 def epipolar_errors(b_from_a: Float64, camera: Camera, pixels_a: Float64, pixels_b: Float64) -> Float64:

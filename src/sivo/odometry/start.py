@@ -14,8 +14,9 @@ from sivo.geometry import se3
 from sivo.geometry.camera import Camera
 from sivo.odometry.local_map import LocalMap, poselib_camera
 from sivo.odometry.settings import OdometrySettings, StartSettings
-from sivo.odometry.view import NO_POINT, View, common_tracks, trusted_matches
+from sivo.odometry.view import NO_POINT, View, common_tracks, trusted_pairs
 from sivo.odometry.window import adjust
+from sivo.tracking.matching import match_units
 from sivo.types import Float64, Int64
 
 
@@ -47,7 +48,8 @@ def two_view_geometry(
     translation and with it all depths would be noise; unless enough points contradict the homography, as before a wall.
     """
     settings = odometry.start
-    rows_a, rows_b = trusted_matches(a, b, descriptor_distance, odometry.trust)
+    matches = match_units(a.descriptors, b.descriptors, descriptor_distance)
+    rows_a, rows_b = matches[trusted_pairs(a, b, matches, odometry.trust)].T
     if len(rows_a) < settings.min_matches:
         return Refusal("too few matches")
     pixels_a, pixels_b = a.keypoints[rows_a], b.keypoints[rows_b]

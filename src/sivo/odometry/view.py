@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sivo.odometry.settings import TrustSettings
-from sivo.tracking.matching import match_units
 from sivo.types import Float32, Float64, Int64
 
 NO_POINT = -1
@@ -80,17 +79,9 @@ def common_tracks(a: View, b: View) -> tuple[Int64, Int64]:
     return rows_a.astype(np.int64), rows_b.astype(np.int64)
 
 
-def trusted_matches(
-    a: View, b: View, descriptor_distance: float, trust: TrustSettings, strongest: int | None = None
-) -> tuple[Int64, Int64]:
-    """Rows of `a` and of `b` that match by their descriptors alone, as far as both ends are trusted.
-
-    Args:
-        strongest: keypoints of each view that take part; None for all.
-    """
-    matches = match_units(a.descriptors[:strongest], b.descriptors[:strongest], descriptor_distance)
-    chosen = matches[trusted(np.minimum(a.weights[matches[:, 0]], b.weights[matches[:, 1]]), trust)]
-    return chosen[:, 0], chosen[:, 1]
+def trusted_pairs(a: View, b: View, matches: Int64, trust: TrustSettings) -> Mask:
+    """Which of the matches (K, 2), rows of `a` and of `b`, a RANSAC may use: those trusted at both ends."""
+    return trusted(np.minimum(a.weights[matches[:, 0]], b.weights[matches[:, 1]]), trust)
 
 
 def trusted(weights: Float64, trust: TrustSettings) -> Mask:
