@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from sivo.types import Float32
 
@@ -16,19 +17,24 @@ _EDGE = 3  # pixels of the image that a response needs around its own: smoothing
 _LEAST_RESPONSE = 1.5e-5  # of the eigenvalue: below it, about one grey level of 256 squared, there is only noise
 
 
-def refine_to_corners(image: Float32, keypoints: Float32, radius: int) -> Float32:
+def refine_to_corners(image: Float32, keypoints: Float32, radius: int) -> tuple[Float32, NDArray[np.bool_]]:
     """Keypoints (N, 2) at the best corner at most `radius` pixels away in x and y; those without one stay.
 
     Args:
         image: (H, W) grey in [0, 1].
         keypoints: (N, 2) x, y in pixels.
+
+    Returns:
+        The keypoints, and whether there is a corner (N,). Where there is none, as where the picture is saturated, a
+        network can still see keypoints, at the same place in each of its cells; they move with the camera.
     """
     if not len(keypoints):
-        return keypoints
+        return keypoints, np.zeros(0, np.bool_)
     steps = np.arange(-radius, radius + 1)
     falloff = np.exp(-(steps[:, None] ** 2 + steps**2) / (2 * (radius / 1.5) ** 2)).astype(np.float32)
     image = np.ascontiguousarray(image, np.float32)
-    return np.asarray(_refine(image, np.ascontiguousarray(keypoints, np.float32), radius, falloff))
+    moved, found = _refine(image, np.ascontiguousarray(keypoints, np.float32), radius, falloff)
+    return moved, found
 
 
 @numba.njit(cache=True, nogil=True)
@@ -44,6 +50,7 @@ def _refine(image, keypoints, radius, falloff):  # type: ignore[no-untyped-def]
     yy, xy = np.empty_like(xx), np.empty_like(xx)
     response = np.empty((count, count), np.float32)
     result = keypoints.copy()
+    found = np.zeros(len(keypoints), np.bool_)
     quarter, half = np.float32(0.25), np.float32(0.5)
     for n in range(len(keypoints)):
         x0, y0 = round(keypoints[n, 0]), round(keypoints[n, 1])
@@ -82,10 +89,11 @@ def _refine(image, keypoints, radius, falloff):  # type: ignore[no-untyped-def]
                     best, row, column = value, i, j
         if row < 0:
             continue
+        found[n] = True
         middle = response[row, column]
         result[n, 0] = x0 + column - reach + _peak(response[row, column - 1], middle, response[row, column + 1])
         result[n, 1] = y0 + row - reach + _peak(response[row - 1, column], middle, response[row + 1, column])
-    return result
+    return result, found
 
 
 @numba.njit(cache=True, nogil=True)

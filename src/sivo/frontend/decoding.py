@@ -34,8 +34,9 @@ def decode(maps: NetworkMaps, row: int, image: Float32, settings: NetworkSetting
     if settings.corner_radius:
         from sivo.frontend.corners import refine_to_corners
 
-        keypoints = refine_to_corners(image, keypoints, settings.corner_radius)
+        keypoints, found = refine_to_corners(image, keypoints, settings.corner_radius)
         kept = first_at_place(keypoints)
+        kept = kept[found[kept]]
         keypoints, scores = keypoints[kept], scores[kept]
     descriptors = sample_descriptors(maps.descriptors[row], keypoints)
     stability = None

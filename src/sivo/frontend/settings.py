@@ -21,7 +21,7 @@ class NetworkSettings:
     nms_radius: int = 4  # pixels: a keypoint is the best of the square of this radius around it
     border: int = 4  # pixels: no keypoints this close to the image's edge
     subpixel_radius: int = 4  # move to the centre of mass of the heat map within this radius; 0 leaves whole pixels
-    corner_radius: int = 5  # then move to the best corner of the image within this radius; 0 leaves the network's word
+    corner_radius: int = 5  # then move to the best corner this near, drop what has none; 0 leaves the network's word
     runtime: Literal["auto", "openvino", "torch"] = "auto"  # auto: openvino on the CPU, torch where device is cuda
     precision: Literal["auto", "float32", "int8", "float16"] = "auto"  # auto: int8 if the weights are calibrated for it
     threads: int = 0  # 0: as many as the machine has

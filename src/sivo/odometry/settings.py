@@ -88,6 +88,10 @@ class TrustSettings:
     least_stability: float = 0.5  # of a keypoint, and of both ends of a match; 0 lets all in
     enough: int = 50  # of them; where there are fewer, all are used, since a doubtful pose is better than none
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.least_stability <= 1:
+            raise ConfigError(f"trust.least_stability={self.least_stability}: is a probability between 0 and 1")
+
 
 @dataclass(frozen=True)
 class OdometrySettings:

@@ -51,6 +51,7 @@ def info_nce_loss(
     scale: Tensor,
     masked_pixels: float,
     negative: Tensor | None = None,
+    across: bool = False,
 ) -> Tensor:
     """Symmetric InfoNCE over sparse correspondences: each descriptor must pick its partner among those of its pair.
 
@@ -60,13 +61,20 @@ def info_nce_loss(
         valid: (B, N) bool.
         scale: () inverse temperature.
         negative: (B, N) bool, which rows may be wrong partners of others; the valid ones where it is not given.
+        across: the points of the other pairs are negatives too.
     """
-    similarity = scale * torch.einsum("bnd,bmd->bnm", a, b)
-    near = (torch.cdist(points_a, points_a) < masked_pixels) | (torch.cdist(points_b, points_b) < masked_pixels)
-    itself = torch.eye(a.shape[1], dtype=torch.bool, device=a.device)
+    pairs, count, _ = a.shape
     negative = valid if negative is None else negative
-    refused = (near & ~itself) | ~negative[:, None, :] | ~negative[:, :, None]
-    similarity = similarity.masked_fill(refused & ~itself, -1e4)
+    near = (torch.cdist(points_a, points_a) < masked_pixels) | (torch.cdist(points_b, points_b) < masked_pixels)
+    refused = near | ~negative[:, None, :] | ~negative[:, :, None]
+    if across:
+        a, b, valid, negative = (part.flatten(0, 1)[None] for part in (a, b, valid, negative))
+        others = ~negative[:, None, :] | ~negative[:, :, None]
+        blocks = torch.arange(pairs * count, device=a.device).view(pairs, count)
+        others[0, blocks[:, :, None], blocks[:, None, :]] = refused
+        refused = others
+    itself = torch.eye(a.shape[1], dtype=torch.bool, device=a.device)
+    similarity = (scale * torch.einsum("bnd,bmd->bnm", a, b)).masked_fill(refused & ~itself, -1e4)
     forward = torch.logsumexp(similarity, dim=2)
     backward = torch.logsumexp(similarity, dim=1)
     right = torch.diagonal(similarity, dim1=1, dim2=2)

@@ -162,6 +162,7 @@ class OdometryTrainingSettings:
     detector_weight: float = 0.3
     descriptor_weight: float = 1.0
     stability_weight: float = 1.0
+    negatives_across: bool = False  # a descriptor must also differ from those of the batch's other pairs
     stability_alone: bool = False  # train only that head, on what the others read: keypoints and descriptors stay
     masked_pixels: float = 8.0  # points nearer than this are not each other's negatives
     detector: DetectorLossSettings = field(default_factory=DetectorLossSettings)
