@@ -173,6 +173,23 @@ def test_a_perfect_frontend_succeeds_a_shuffled_or_blind_one_fails_and_nothing_i
     json.dumps(results(outcome), allow_nan=False)
 
 
+def test_differences_are_taken_pair_by_pair(tmp_path: Path) -> None:
+    outcome = run(tmp_path, PlaneFeatures(), PlaneFeatures("same"), PlaneFeatures("shuffled", shuffled=True))
+    found = results(outcome)
+    same, shuffled = ([row for row in found["differences"] if row["frontend"] == name] for name in ("same", "shuffled"))
+    assert len(same) == len(shuffled) == len(SETTINGS.gaps) * len(SETTINGS.estimators)
+    for row in same:
+        assert row["rotation_success"] == row["inlier_share"] == 0.0
+        assert row["rotation_success_interval"] == [0.0, 0.0]
+    for row in shuffled:
+        assert row["pose_success"] == -1.0
+        assert row["precision_interval"][1] < 0
+    printed = pose_tables(found)
+    assert "Differences to perfect" in printed
+    assert "**-1.000 (-1.000 to -1.000)**" in printed
+    assert "Differences" not in pose_tables(results(run(tmp_path / "alone", PlaneFeatures())))
+
+
 def test_noise_moves_the_error_the_right_way(tmp_path: Path) -> None:
     levels = [PlaneFeatures(f"noise {noise}", noise=noise) for noise in (0.0, 0.5, 2.0)]
     outcome = run(tmp_path, *levels)

@@ -207,6 +207,24 @@ def test_keypoints_without_a_partner_are_wrong_ones_for_the_others() -> None:
     assert float(among) == pytest.approx(np.log(1 + np.exp(-2.0)), rel=1e-5)
 
 
+def test_negatives_across_pairs_change_nothing_for_one_pair_and_are_harder_for_more() -> None:
+    generator = torch.Generator().manual_seed(0)
+    a = torch.nn.functional.normalize(torch.randn(3, 20, 16, generator=generator), dim=2)
+    b = torch.nn.functional.normalize(a + 0.5 * torch.randn(3, 20, 16, generator=generator), dim=2)
+    places = 100 * torch.rand(3, 20, 2, generator=generator)
+    valid = torch.rand(3, 20, generator=generator) > 0.3
+    scale = torch.tensor(20.0)
+
+    def loss(rows: slice, across: bool) -> float:
+        parts = [part[rows] for part in (a, b, places, places, valid)]
+        return float(info_nce_loss(*parts, scale, 8.0, across=across))
+
+    assert loss(slice(0, 1), True) == pytest.approx(loss(slice(0, 1), False))
+    assert loss(slice(0, 3), True) > loss(slice(0, 3), False) + 0.1
+    separate = sum(loss(slice(k, k + 1), True) * int(valid[k].sum()) for k in range(3)) / int(valid.sum())
+    assert loss(slice(0, 3), False) == pytest.approx(separate)
+
+
 def test_the_stability_loss_is_balanced() -> None:
     logits = torch.tensor([[[0.0, 2.0]] * 9 + [[0.0, 2.0]]])
     stability = torch.tensor([[1] * 9 + [0]])

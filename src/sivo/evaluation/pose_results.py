@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sivo.config import to_dict
 from sivo.evaluation.measures import relative_motion
@@ -23,10 +24,11 @@ def results(run: PoseRun) -> dict[str, Any]:
     """Everything that `pose.json` holds.
 
     `rows` has one entry per frontend, estimator and gap over all sequences, `sequence_rows` the same for each
-    sequence, `curves` the accuracy over thresholds, `gaps` the average relative pose, `sequences` what was used.
+    sequence, `differences` how each frontend but the first differs from the first on the same pairs, `curves` the
+    accuracy over thresholds, `gaps` the average relative pose, `sequences` what was used.
     """
     settings = run.settings
-    rows, sequence_rows, curves = [], [], []
+    rows, sequence_rows, curves, differences = [], [], [], []
     for gap in settings.gaps:
         in_gap = run.records[run.records["gap"] == gap]
         bootstraps: dict[int | None, Bootstrap] = {None: _bootstrap(in_gap, settings)}
@@ -37,6 +39,9 @@ def results(run: PoseRun) -> dict[str, Any]:
                 chosen = in_gap[(in_gap["frontend"] == frontend) & (in_gap["estimator"] == estimator)]
                 head = {"frontend": label, "estimator": solver, "gap": gap}
                 rows.append({**head, **_row(chosen, settings, bootstraps[None])})
+                if frontend:
+                    first = in_gap[(in_gap["frontend"] == 0) & (in_gap["estimator"] == estimator)]
+                    differences.append({**head, **_difference(first, chosen, settings, bootstraps[None])})
                 curves.append({**head, **_curves(chosen, settings)})
                 for sequence in np.unique(chosen["sequence"]):
                     part = chosen[chosen["sequence"] == sequence]
@@ -50,6 +55,7 @@ def results(run: PoseRun) -> dict[str, Any]:
         "gaps": [_average_relative_pose(run, gap) for gap in settings.gaps],
         "rows": rows,
         "sequence_rows": sequence_rows,
+        "differences": differences,
         "curves": curves,
     }
 
@@ -57,8 +63,31 @@ def results(run: PoseRun) -> dict[str, Any]:
 def _row(records: Records, settings: PoseSettings, bootstrap: Bootstrap) -> dict[str, Any]:
     """One cell of Table 1 with all that explains it; every mean is over pairs and has its interval."""
     rotation, translation = records["rotation_deg"], records["translation_m"]
+    row: dict[str, Any] = {"pairs": len(records)}
+    for name, values in _of_pairs(records, settings).items():
+        row[name] = float(np.mean(values))
+        row[f"{name}_interval"] = list(bootstrap.interval(values))
+    row["failures"] = int(np.isinf(rotation).sum())  # pairs without any pose; they count as failures everywhere
+    row["median_rotation_deg"] = _finite(np.median(rotation))
+    row["median_translation_m"] = _finite(np.median(translation))
+    return row
+
+
+def _difference(first: Records, second: Records, settings: PoseSettings, bootstrap: Bootstrap) -> dict[str, Any]:
+    """Mean differences, second minus first, pair by pair: what is hard for both counts for neither."""
+    row: dict[str, Any] = {}
+    before, after = _of_pairs(first, settings), _of_pairs(second, settings)
+    for name, values in before.items():
+        change = after[name].astype(np.float64) - values
+        row[name], row[f"{name}_interval"] = float(np.mean(change)), list(bootstrap.interval(change))
+    return row
+
+
+def _of_pairs(records: Records, settings: PoseSettings) -> dict[str, NDArray[Any]]:
+    """What is averaged over pairs (N,), by name."""
+    rotation, translation = records["rotation_deg"], records["translation_m"]
     turned, moved = below(rotation, settings.max_rotation_deg), below(translation, settings.max_translation_m)
-    means = {
+    return {
         "rotation_success": turned,
         "translation_success": moved,
         "pose_success": turned & moved,
@@ -71,15 +100,8 @@ def _row(records: Records, settings: PoseSettings, bootstrap: Bootstrap) -> dict
         "judged_matches": records["judged"],
         "right_matches": records["right"],
         "inliers": records["inliers"],
+        "inlier_share": share(records["inliers"], records["judged"]),
     }
-    row: dict[str, Any] = {"pairs": len(records)}
-    for name, values in means.items():
-        row[name] = float(np.mean(values))
-        row[f"{name}_interval"] = list(bootstrap.interval(values))
-    row["failures"] = int(np.isinf(rotation).sum())  # pairs without any pose; they count as failures everywhere
-    row["median_rotation_deg"] = _finite(np.median(rotation))
-    row["median_translation_m"] = _finite(np.median(translation))
-    return row
 
 
 def share(part: Any, whole: Any) -> Float64:

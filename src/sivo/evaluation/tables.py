@@ -65,6 +65,10 @@ def pose_tables(results: dict[str, Any], sequences: bool = False) -> str:
             f"{100 * settings['confidence']:.0f} % bootstrap intervals of the same cells:",
             _intervals(results, estimator),
         ]
+    if results.get("differences"):
+        first = results["frontends"][0]
+        parts.append(f"### Differences to {first}, on the same pairs (bold where the interval leaves out zero)")
+        parts += [_differences(results, estimator) for estimator in settings["estimators"]]
     limit = f"{settings['max_error_px']:g} px"
     parts.append(f"### Matching (matches with depth; repeated and right below {limit})")
     parts += [_matching(results, gap) for gap in settings["gaps"]]
@@ -136,6 +140,27 @@ def _intervals(results: dict[str, Any], estimator: str) -> str:
             spans = [_cell(results["rows"], frontend, estimator, gap, f"{field}_interval") for frontend in frontends]
             columns.append([f"{decimals(low, 2)}-{decimals(high, 2)}" for low, high in spans])
     return markdown(header, columns_to_rows(frontends, columns))
+
+
+def _differences(results: dict[str, Any], estimator: str) -> str:
+    """What each frontend but the first adds to the first, with the interval over pairs."""
+    fields = {
+        "rotation_success": "rot.",
+        "translation_success": "transl.",
+        "rotation_auc": "rot. area",
+        "translation_auc": "transl. area",
+        "precision": "precision",
+        "inlier_share": "inliers / matches",
+    }
+    chosen = [row for row in results["differences"] if row["estimator"] == estimator]
+
+    def cell(row: dict[str, Any], field: str) -> str:
+        low, high = row[f"{field}_interval"]
+        text = f"{row[field]:+.3f} ({low:+.3f} to {high:+.3f})"
+        return f"**{text}**" if low > 0 or high < 0 else text
+
+    rows = [[f"{row['frontend']}, gap {row['gap']}", *(cell(row, field) for field in fields)] for row in chosen]
+    return markdown([estimator, *fields.values()], rows)
 
 
 def _matching(results: dict[str, Any], gap: int) -> str:

@@ -9,7 +9,7 @@ from sivo.labeling.settings import LabelSettings
 from sivo.odometry.settings import OdometrySettings
 from sivo.sequences.base import SequenceSettings
 
-DEFAULT_FRONTEND = "sift"
+DEFAULT_FRONTEND = "superpoint-vo"
 
 
 @dataclass(frozen=True)
