@@ -10,7 +10,7 @@ from sivo.cli.options import add_config_arguments
 SETTINGS = {  # command -> its settings
     "simulate": "sivo.simulation.settings:SimulationSettings",
     "improve": "sivo.improvement.settings:ImproveSettings",
-    "label": "sivo.odometry.run_settings:RunSettings",
+    "label": "sivo.odometry.run_settings:LabelRunSettings",
     "run": "sivo.odometry.run_settings:RunSettings",
     "evaluate-pose": "sivo.evaluation.settings:PoseCommandSettings",
     "evaluate-trajectory": "sivo.evaluation.settings:TrajectoryCommandSettings",

@@ -13,12 +13,12 @@ from sivo.cli.options import (
     add_sequence_arguments,
     settings_from,
 )
-from sivo.odometry.run_settings import RunSettings
+from sivo.odometry.run_settings import LabelRunSettings
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `sivo label`."""
-    defaults = RunSettings()
+    defaults = LabelRunSettings()
     parser.add_argument(
         "sequences", type=Path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
     )
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Label what is not labelled yet; 0 unless nothing could be."""
-    settings = settings_from(RunSettings, arguments, FRONTEND_FLAGS | {"max_stray": "odometry.matching.max_stray"})
+    settings = settings_from(LabelRunSettings, arguments, FRONTEND_FLAGS | {"max_stray": "odometry.matching.max_stray"})
     from tqdm import tqdm
 
     from sivo.improvement.labelling import label_sequences

@@ -19,7 +19,6 @@ class FrontendSettings:
     name: str = DEFAULT_FRONTEND  # sift, orb, akaze, surf, a bundled network, or a .safetensors file
     max_keypoints: int = 1000
     use_stability: bool = True  # weigh observations with the frontend's stability, where it has one
-
     least_stability: float = 0.0  # drop keypoints that the frontend's stability head gives less; 0 keeps all
 
     def __post_init__(self) -> None:
@@ -37,3 +36,10 @@ class RunSettings:
     frontend: FrontendSettings = field(default_factory=FrontendSettings)
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     labels: LabelSettings = field(default_factory=LabelSettings)
+
+
+@dataclass(frozen=True)
+class LabelRunSettings(RunSettings):
+    """All settings of `sivo label`: those of a run, with a frontend that has no opinion of its own on stability."""
+
+    frontend: FrontendSettings = field(default_factory=lambda: FrontendSettings(name="sift"))
