@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from sivo.cli.train_homographies import read_data_card
 from sivo.frontend.calibration import calibrate
-from sivo.frontend.weights import BUNDLED, load_weights, save_weights
+from sivo.frontend.weights import BUNDLED, Weights, load_weights, save_weights
 
 NO_HEAD = "The stability head is not part of these weights: only VO adaptation can teach it. "
 ATTRIBUTION = (
@@ -36,6 +37,13 @@ def pose_figures(path: Path, label: str) -> dict[str, Any]:
     return figures
 
 
+def with_stability_odds(weights: Weights, ratio: float) -> Weights:
+    """The same weights, with the odds of "stable" multiplied by `ratio` everywhere."""
+    bias = weights.tensors["stability.1.convolution.bias"].copy()  # (2,) logits of unstable and stable
+    bias[1] += np.float32(np.log(ratio))
+    return replace(weights, tensors={**weights.tensors, "stability.1.convolution.bias": bias})
+
+
 def main() -> None:
     """Write the bundled file and its card."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -46,6 +54,14 @@ def main() -> None:
         "--data-card", type=Path, help="what the weights were trained on, where their card does not say it all"
     )
     parser.add_argument("--start", help="the bundled weights that they began as")
+    parser.add_argument("--commit", help="of the code that trained them, where it was not yet committed")
+    parser.add_argument(
+        "--stability-odds",
+        type=float,
+        default=1.0,
+        metavar="RATIO",
+        help="stable points to an unstable one where the weights will be used; the head was trained on one to one",
+    )
     parser.add_argument("--calibrate", type=Path, metavar="FOLDER", help="pictures for the int8 runtime")
     arguments = parser.parse_args()
     weights = load_weights(arguments.weights)
@@ -63,6 +79,12 @@ def main() -> None:
         card = replace(card, data=read_data_card(arguments.data_card))
     if arguments.start:
         card = replace(card, training={**card.training, "start": arguments.start})
+    if arguments.commit:
+        card = replace(card, commit=arguments.commit)
+    if arguments.stability_odds != 1:
+        odds = f"The stability head was trained on balanced labels; its odds times {arguments.stability_odds:g}. "
+        card = replace(card, notes=odds + card.notes)
+        weights = with_stability_odds(weights, arguments.stability_odds)
     weights = replace(weights, card=card)
     if arguments.calibrate:
         files = sorted(arguments.calibrate.glob("*.jpg"))[::6]
