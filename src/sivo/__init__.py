@@ -3,7 +3,7 @@
 The API is as short as the paper::
 
     sequence = sivo.open_sequence("video.mp4", camera="camera.yaml")
-    frontend = sivo.load_frontend("sift")
+    frontend = sivo.load_frontend("superpoint-vo")
     odometry = sivo.VisualOdometry(frontend, sequence.camera)
     for frame in sequence:
         odometry.track(frame)
