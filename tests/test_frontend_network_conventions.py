@@ -205,6 +205,9 @@ def test_keypoints_that_meet_at_one_corner_are_one_feature():
     image[:40, :50] = image[40:, 50:] = 200
     everywhere = {"subpixel_radius": 0, "nms_radius": 0, "threshold": 0.0, "max_keypoints": 10000}
     moved = NetworkFrontend(lit_pixel_weights(), NetworkSettings(**everywhere))(image)
+    alone = NetworkFrontend(lit_pixel_weights(), NetworkSettings(**everywhere, corner_radius=0))(image)
+    refined, found = refine_to_corners(image.astype(np.float32) / 255, alone.keypoints, NetworkSettings().corner_radius)
     places = np.round(moved.keypoints)
-    assert len(np.unique(places, axis=0)) == len(places)
-    assert 1 <= len(moved) < 40  # of some three hundred pixels from which the corner is within reach
+    assert len(np.unique(places, axis=0)) == len(places) == len(np.unique(np.round(refined[found]), axis=0))
+    near = 17 * 17  # pixels from which the corner's response, itself some pixels wide, is within reach
+    assert 50 < found.sum() - len(moved) < near

@@ -63,10 +63,7 @@ def results(run: PoseRun) -> dict[str, Any]:
 def _row(records: Records, settings: PoseSettings, bootstrap: Bootstrap) -> dict[str, Any]:
     """One cell of Table 1 with all that explains it; every mean is over pairs and has its interval."""
     rotation, translation = records["rotation_deg"], records["translation_m"]
-    row: dict[str, Any] = {"pairs": len(records)}
-    for name, values in _of_pairs(records, settings).items():
-        row[name] = float(np.mean(values))
-        row[f"{name}_interval"] = list(bootstrap.interval(values))
+    row = {"pairs": len(records), **_means(_of_pairs(records, settings), bootstrap)}
     row["failures"] = int(np.isinf(rotation).sum())  # pairs without any pose; they count as failures everywhere
     row["median_rotation_deg"] = _finite(np.median(rotation))
     row["median_translation_m"] = _finite(np.median(translation))
@@ -75,11 +72,16 @@ def _row(records: Records, settings: PoseSettings, bootstrap: Bootstrap) -> dict
 
 def _difference(first: Records, second: Records, settings: PoseSettings, bootstrap: Bootstrap) -> dict[str, Any]:
     """Mean differences, second minus first, pair by pair: what is hard for both counts for neither."""
-    row: dict[str, Any] = {}
     before, after = _of_pairs(first, settings), _of_pairs(second, settings)
-    for name, values in before.items():
-        change = after[name].astype(np.float64) - values
-        row[name], row[f"{name}_interval"] = float(np.mean(change)), list(bootstrap.interval(change))
+    return _means({name: after[name].astype(np.float64) - before[name] for name in before}, bootstrap)
+
+
+def _means(values: dict[str, NDArray[Any]], bootstrap: Bootstrap) -> dict[str, Any]:
+    """The mean of each of the values (N,), and its interval as `..._interval`."""
+    row: dict[str, Any] = {}
+    for name, of_pairs in values.items():
+        row[name] = float(np.mean(of_pairs))
+        row[f"{name}_interval"] = list(bootstrap.interval(of_pairs))
     return row
 
 

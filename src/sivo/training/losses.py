@@ -63,16 +63,12 @@ def info_nce_loss(
         negative: (B, N) bool, which rows may be wrong partners of others; the valid ones where it is not given.
         across: the points of the other pairs are negatives too.
     """
-    pairs, count, _ = a.shape
     negative = valid if negative is None else negative
     near = (torch.cdist(points_a, points_a) < masked_pixels) | (torch.cdist(points_b, points_b) < masked_pixels)
-    refused = near | ~negative[:, None, :] | ~negative[:, :, None]
-    if across:
+    if across:  # one large pair, in which only points of the same view can be near each other
+        near = torch.block_diag(*near)[None]
         a, b, valid, negative = (part.flatten(0, 1)[None] for part in (a, b, valid, negative))
-        others = ~negative[:, None, :] | ~negative[:, :, None]
-        blocks = torch.arange(pairs * count, device=a.device).view(pairs, count)
-        others[0, blocks[:, :, None], blocks[:, None, :]] = refused
-        refused = others
+    refused = near | ~negative[:, None, :] | ~negative[:, :, None]
     itself = torch.eye(a.shape[1], dtype=torch.bool, device=a.device)
     similarity = (scale * torch.einsum("bnd,bmd->bnm", a, b)).masked_fill(refused & ~itself, -1e4)
     forward = torch.logsumexp(similarity, dim=2)
