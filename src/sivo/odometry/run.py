@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import platform
+import signal
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
+from threading import current_thread, main_thread
 from typing import Any
 
 import numpy as np
@@ -111,19 +114,36 @@ def _track_all(
     processed: list[int] = []
     try:
         for detected in detected_ahead(sequence, frontend, odometry.match):
-            start = time.perf_counter()
-            view = odometry.track_matched(detected.matched, detected.frame.time)
-            seconds["track and adjust"] += time.perf_counter() - start
-            seconds["read"] += detected.reading
-            seconds["detect"] += detected.detecting
-            seconds["match"] += detected.matching
-            processed.append(detected.frame.index)
-            viewer.show(detected.frame, view, odometry.running_points)
-            if progress is not None:
-                progress(view)
+            with _interrupts_wait():
+                start = time.perf_counter()
+                view = odometry.track_matched(detected.matched, detected.frame.time)
+                seconds["track and adjust"] += time.perf_counter() - start
+                seconds["read"] += detected.reading
+                seconds["detect"] += detected.detecting
+                seconds["match"] += detected.matching
+                processed.append(detected.frame.index)
+                viewer.show(detected.frame, view, odometry.running_points)
+                if progress is not None:
+                    progress(view)
     except KeyboardInterrupt:
         return processed, True
     return processed, False
+
+
+@contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """Ctrl-C takes effect at the end: compiled code would make a SystemError of it, and half a frame would be left."""
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler or current_thread() is not main_thread():
+        yield
+        return
+    came: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if came:
+        raise KeyboardInterrupt
 
 
 def _report(
