@@ -6,7 +6,7 @@ BIN = $(VENV)/bin
 .PHONY: demo test lint docs clean
 
 demo: $(VENV)/.run-installed
-	$(BIN)/sivo demo -o output/demo
+	$(BIN)/improvo demo -o output/demo
 
 # The training tests have a process of their own: PyTorch once crashed there after all the other libraries' threads.
 test: $(VENV)/.dev-installed lint

@@ -24,10 +24,10 @@ import numpy as np
 from backend_frames import first_window, ours, paper, position_error, slide
 from backend_windows import Recording, cut_window, real_recording, simulated_recording
 from ceres_program import CeresMissingError, build, solve_with_ceres
-from sivo.backend import BundleProblem, ObjectiveSettings, SolverSettings, solve
-from sivo.backend.compile import compile_kernels
-from sivo.backend.solver import PARTS
-from sivo.files import write_json
+from improvo.backend import BundleProblem, ObjectiveSettings, SolverSettings, solve
+from improvo.backend.compile import compile_kernels
+from improvo.backend.solver import PARTS
+from improvo.files import write_json
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 ITERATIONS = 15  # of the timed runs
@@ -109,7 +109,7 @@ def _compare_optima(program: Path, problem: BundleProblem) -> dict[str, object]:
         "start_difference": abs(theirs.initial_cost - mine.initial_cost) / mine.initial_cost,
         "cost_difference": abs(theirs.cost - mine.cost) / mine.cost,
         "cost": mine.cost,
-        "iterations_to_the_end": {"ceres": theirs.iterations, "sivo": mine.iterations},
+        "iterations_to_the_end": {"ceres": theirs.iterations, "improvo": mine.iterations},
         "ceres_version": theirs.version,
     }
 
@@ -140,26 +140,26 @@ def _compare_speed(program: Path, problem: BundleProblem) -> dict[str, object]:
         "iteration_speedup": theirs["exact"] / mine["exact"][0],
         "iteration_speedup_without_regulariser": theirs["plain"] / mine["plain"][0],
         "ceres_ms": {kind: 1e3 * value for kind, value in theirs.items()},
-        "sivo_ms": {kind: 1e3 * value[0] for kind, value in mine.items()},
+        "improvo_ms": {kind: 1e3 * value[0] for kind, value in mine.items()},
         "ceres_parts_ms": parts,
-        "sivo_parts_ms": mine["exact"][1],
+        "improvo_parts_ms": mine["exact"][1],
         "ceres_threads": threads,
     }
 
 
 def _print_window(row: dict[str, object]) -> None:
-    ceres, sivo = row["ceres_ms"], row["sivo_ms"]
+    ceres, improvo = row["ceres_ms"], row["improvo_ms"]
     print(
         f"\n{row['window']}: {row['points']} points, {row['observations'][0]} + {row['observations'][1]} observations"
     )
     print(
         f"  to the end: cost {row['cost']:.6f}, relative difference {row['cost_difference']:.1e}, "
-        f"iterations Ceres {row['iterations_to_the_end']['ceres']}, sivo {row['iterations_to_the_end']['sivo']}"
+        f"iterations Ceres {row['iterations_to_the_end']['ceres']}, improvo {row['iterations_to_the_end']['improvo']}"
     )
-    print(f"  ms per iteration, 1 thread       Ceres {row['ceres_version']}      sivo    ratio")
+    print(f"  ms per iteration, 1 thread       Ceres {row['ceres_version']}      improvo    ratio")
     for kind, label in (("exact", "exact objective"), ("plain", "without depth regulariser")):
-        print(f"    {label:28s} {ceres[kind]:10.2f} {sivo[kind]:9.2f} {ceres[kind] / sivo[kind]:8.1f}")
-    for label, parts in (("sivo", row["sivo_parts_ms"]), ("Ceres, its own wall clock", row["ceres_parts_ms"])):
+        print(f"    {label:28s} {ceres[kind]:10.2f} {improvo[kind]:9.2f} {ceres[kind] / improvo[kind]:8.1f}")
+    for label, parts in (("improvo", row["improvo_parts_ms"]), ("Ceres, its own wall clock", row["ceres_parts_ms"])):
         print(f"    {label}: " + ", ".join(f"{part} {ms:.3f}" for part, ms in parts.items()))
 
 
@@ -176,14 +176,14 @@ def _compare_frames(program: Path, recording: Recording, frames: int) -> dict[st
         "frames": frames,
         "frame_speedup": float(np.median(theirs.seconds) / np.median(mine.seconds)),
         "paper_ms": 1e3 * float(np.median(theirs.seconds)),
-        "sivo_ms": 1e3 * float(np.median(mine.seconds)),
+        "improvo_ms": 1e3 * float(np.median(mine.seconds)),
         "paper_iterations": float(np.mean(theirs.iterations)),
-        "sivo_iterations": float(np.mean(mine.iterations)),
+        "improvo_iterations": float(np.mean(mine.iterations)),
         "paper_error_percent": position_error(theirs, new),
-        "sivo_error_percent": position_error(mine, new),
+        "improvo_error_percent": position_error(mine, new),
     }
     print(f"\n{recording.name}, {frames} new frames one by one: median ms, iterations, position error (% of path)")
-    for label, key in (("paper's procedure with Ceres", "paper"), ("sivo", "sivo")):
+    for label, key in (("paper's procedure with Ceres", "paper"), ("improvo", "improvo")):
         figures = row[f"{key}_ms"], row[f"{key}_iterations"], row[f"{key}_error_percent"]
         print("  {:30s} {:8.1f} {:6.1f} {:7.2f}".format(label, *figures))
     print(f"  ratio {row['frame_speedup']:33.1f}")

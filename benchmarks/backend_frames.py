@@ -10,10 +10,10 @@ import numpy as np
 import poselib
 
 from backend_windows import Recording, triangulate
-from sivo.backend import BundleProblem, BundleResult, SolverSettings, solve, triangulate_tracks
-from sivo.geometry import se3
-from sivo.geometry.alignment import align_points
-from sivo.types import Float64, Int64
+from improvo.backend import BundleProblem, BundleResult, SolverSettings, solve, triangulate_tracks
+from improvo.geometry import se3
+from improvo.geometry.alignment import align_points
+from improvo.types import Float64, Int64
 
 WINDOW = 30  # poses that are optimised (paper, N_last)
 MAX_ERROR = 3.0  # pixels, over which our procedure drops an observation

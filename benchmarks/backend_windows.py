@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from sivo.backend import BundleProblem, Triangulation, triangulate_tracks
-from sivo.backend.simulated import simulated_window
-from sivo.frontend.registry import load_frontend
-from sivo.geometry import se3
-from sivo.sequences import open_sequence
-from sivo.tracking.connect import TrackChain
-from sivo.tracking.matching import mutual_nearest_neighbours
-from sivo.types import Float64, Int64
+from improvo.backend import BundleProblem, Triangulation, triangulate_tracks
+from improvo.backend.simulated import simulated_window
+from improvo.frontend.registry import load_frontend
+from improvo.geometry import se3
+from improvo.sequences import open_sequence
+from improvo.tracking.connect import TrackChain
+from improvo.tracking.matching import mutual_nearest_neighbours
+from improvo.types import Float64, Int64
 
 MIN_TRACK = 3  # observations
 MAX_TRUTH_ERROR = 15.0  # pixels under the true poses, above which a real link is left out

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sivo.backend import BundleProblem, ObjectiveSettings
-from sivo.geometry import se3
-from sivo.types import Float64
+from improvo.backend import BundleProblem, ObjectiveSettings
+from improvo.geometry import se3
+from improvo.types import Float64
 
 SOURCE = Path(__file__).parent / "ceres"
 

@@ -6,10 +6,10 @@ import argparse
 
 import numpy as np
 
-from sivo.frontend.network import load_network_frontend
-from sivo.training.precision import ScoredDetector, classical_detectors, mean_average_precision, shape_tests
-from sivo.training.settings import PhotometricSettings
-from sivo.types import Float32, UInt8
+from improvo.frontend.network import load_network_frontend
+from improvo.training.precision import ScoredDetector, classical_detectors, mean_average_precision, shape_tests
+from improvo.training.settings import PhotometricSettings
+from improvo.types import Float32, UInt8
 
 
 def network(name: str, keypoints: int = 100) -> ScoredDetector:

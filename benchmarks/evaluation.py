@@ -18,15 +18,15 @@ from pathlib import Path
 
 import numpy as np
 
-from sivo.evaluation.cache import write_cache
-from sivo.evaluation.pairs import SequencePairs, pairs_of_sequence
-from sivo.evaluation.parallel import Workers, available_cores
-from sivo.evaluation.pose import ExtractionTask, evaluate_pairs, extract, pair_tasks
-from sivo.evaluation.pose_results import results
-from sivo.evaluation.pose_run import PoseRun
-from sivo.evaluation.settings import PoseSettings
-from sivo.evaluation.sources import LoadedFrontend, Recorded
-from sivo.types import Features
+from improvo.evaluation.cache import write_cache
+from improvo.evaluation.pairs import SequencePairs, pairs_of_sequence
+from improvo.evaluation.parallel import Workers, available_cores
+from improvo.evaluation.pose import ExtractionTask, evaluate_pairs, extract, pair_tasks
+from improvo.evaluation.pose_results import results
+from improvo.evaluation.pose_run import PoseRun
+from improvo.evaluation.settings import PoseSettings
+from improvo.evaluation.sources import LoadedFrontend, Recorded
+from improvo.types import Features
 
 
 @dataclass(frozen=True)

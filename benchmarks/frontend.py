@@ -24,16 +24,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sivo.frontend.architecture import ARCHITECTURES
-from sivo.frontend.calibration import calibrate
-from sivo.frontend.classical import ClassicalFrontend
-from sivo.frontend.decoding import decode
-from sivo.frontend.live_channels import without_dead_channels
-from sivo.frontend.network import NetworkFrontend, prepare
-from sivo.frontend.settings import NetworkSettings
-from sivo.frontend.weights import ModelCard, Weights, bundled_names, expected_shapes, find_weights, load_weights
-from sivo.tracking.matching import mutual_nearest_neighbours
-from sivo.types import UInt8
+from improvo.frontend.architecture import ARCHITECTURES
+from improvo.frontend.calibration import calibrate
+from improvo.frontend.classical import ClassicalFrontend
+from improvo.frontend.decoding import decode
+from improvo.frontend.live_channels import without_dead_channels
+from improvo.frontend.network import NetworkFrontend, prepare
+from improvo.frontend.settings import NetworkSettings
+from improvo.frontend.weights import ModelCard, Weights, bundled_names, expected_shapes, find_weights, load_weights
+from improvo.tracking.matching import mutual_nearest_neighbours
+from improvo.types import UInt8
 
 SIZES = ((480, 640), (240, 320))
 KEYPOINTS = 500
@@ -160,7 +160,7 @@ def torch_contenders(weights: Weights, batch: Any, threads: int) -> dict[str, Ca
         import torch
     except ImportError:
         return {}
-    from sivo.frontend.runtime_torch import TorchRuntime, load_network
+    from improvo.frontend.runtime_torch import TorchRuntime, load_network
 
     # Eager as anyone would write it: the module, contiguous, batch norm in evaluation mode where there is one.
     eager, channels_last = load_network(weights), TorchRuntime(weights, threads=threads)
@@ -184,7 +184,7 @@ def onnx_contenders(weights: Weights, batch: Any, threads: int) -> dict[str, Cal
         return {}
     from tempfile import TemporaryDirectory
 
-    from sivo.frontend.onnx_export import export_onnx
+    from improvo.frontend.onnx_export import export_onnx
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads

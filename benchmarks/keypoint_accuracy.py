@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from sivo.frontend import Frontend
-from sivo.frontend.network import load_network_frontend
-from sivo.frontend.registry import load_frontend
-from sivo.geometry.se3 import inverse, transform
-from sivo.sequences import Sequence, open_sequence
-from sivo.simulation import bundled_sequence
-from sivo.tracking.matching import mutual_nearest_neighbours
-from sivo.types import Float64
+from improvo.frontend import Frontend
+from improvo.frontend.network import load_network_frontend
+from improvo.frontend.registry import load_frontend
+from improvo.geometry.se3 import inverse, transform
+from improvo.sequences import Sequence, open_sequence
+from improvo.simulation import bundled_sequence
+from improvo.tracking.matching import mutual_nearest_neighbours
+from improvo.types import Float64
 
 KEYPOINTS = 500
 RADII = (0, 3, 4, 5, 6)

@@ -1,4 +1,4 @@
-"""Kills `sivo improve`, which labels, trains and judges, at random moments (kill -9), and starts it again.
+"""Kills `improvo improve`, which labels, trains and judges, at random moments (kill -9), and starts it again.
 
     python benchmarks/killed_improve.py [--kills 10] [--seed 0]
 
@@ -21,8 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sivo.frontend.weights import load_weights
-from sivo.simulation import bundled_sequence
+from improvo.frontend.weights import load_weights
+from improvo.simulation import bundled_sequence
 
 TABLES = ("tracks.parquet", "points.parquet", "frames.parquet", "trajectory.txt")
 OPTIONS = [
@@ -34,14 +34,14 @@ OPTIONS = [
 
 def start(out: Path) -> subprocess.Popen[bytes]:
     """The command in a process group of its own."""
-    words = [sys.executable, "-m", "sivo", "improve", str(bundled_sequence()), "-o", str(out), *OPTIONS]
+    words = [sys.executable, "-m", "improvo", "improve", str(bundled_sequence()), "-o", str(out), *OPTIONS]
     return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
 
 
 def finish(out: Path) -> None:
     """Run the command to its end."""
     if start(out).wait():
-        raise SystemExit(f"sivo improve failed in {out}")
+        raise SystemExit(f"improvo improve failed in {out}")
 
 
 def contents(out: Path) -> dict[str, bytes]:

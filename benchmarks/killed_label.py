@@ -1,4 +1,4 @@
-"""Kills `sivo label` at random moments (kill -9) and looks whether it resumes to the same labels.
+"""Kills `improvo label` at random moments (kill -9) and looks whether it resumes to the same labels.
 
     python benchmarks/killed_label.py [--kills 10] [--workers 1] [--seed 0]
 
@@ -22,8 +22,8 @@ from pathlib import Path
 import pyarrow.parquet as pq
 from rendered_walk import write_walk  # of the tests: run with PYTHONPATH=tests
 
-from sivo.labeling.labelled import read_labels
-from sivo.labeling.store import read_records
+from improvo.labeling.labelled import read_labels
+from improvo.labeling.store import read_records
 
 OPTIONS = ["--frontend", "orb", "--max-keypoints", "300", "--set", "labels.min_observations=6", "--pack"]
 TABLES = ("tracks.parquet", "points.parquet", "frames.parquet", "trajectory.txt", "map.ply", "images-00000.parquet")
@@ -71,7 +71,7 @@ def main() -> None:
 
 def _start(walks: list[Path], store: Path, workers: int) -> subprocess.Popen[bytes]:
     """The command in a process group of its own, with its workers."""
-    command = [sys.executable, "-m", "sivo", "label", *map(str, walks), "-o", str(store), *OPTIONS]
+    command = [sys.executable, "-m", "improvo", "label", *map(str, walks), "-o", str(store), *OPTIONS]
     return subprocess.Popen(
         [*command, "--workers", str(workers)],
         stdout=subprocess.DEVNULL,

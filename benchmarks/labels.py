@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sivo.files import write_json
-from sivo.geometry import se3
-from sivo.labeling.settings import LabelSettings
-from sivo.labeling.stability import STABLE, UNSTABLE, label_stability
-from sivo.types import Float64, Tracks
+from improvo.files import write_json
+from improvo.geometry import se3
+from improvo.labeling.settings import LabelSettings
+from improvo.labeling.stability import STABLE, UNSTABLE, label_stability
+from improvo.types import Float64, Tracks
 
 FRAMES = 60
 K = np.array([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])

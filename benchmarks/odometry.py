@@ -4,7 +4,7 @@
     python benchmarks/odometry.py --sequence kitti00 --frontend orb --mode robust --seeds 1
 
 Each row: frames with a pose, segments, ATE after Sim3 per segment as % of the true path, relative errors over 2 s,
-milliseconds per frame of the frontend and of everything else (one thread each; `sivo run` overlaps the two), and
+milliseconds per frame of the frontend and of everything else (one thread each; `improvo run` overlaps the two), and
 whether the run is silently wrong: a segment with over 5 % of ATE and no alarm of the two-view check.
 """
 
@@ -24,14 +24,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sivo.backend.compile import compile_kernels
-from sivo.evaluation.settings import TrajectorySettings
-from sivo.evaluation.trajectory import evaluate_trajectory
-from sivo.frontend.registry import load_odometry_frontend
-from sivo.odometry.settings import OdometrySettings
-from sivo.odometry.visual_odometry import VisualOdometry
-from sivo.sequences import open_sequence
-from sivo.types import Features, Trajectory
+from improvo.backend.compile import compile_kernels
+from improvo.evaluation.settings import TrajectorySettings
+from improvo.evaluation.trajectory import evaluate_trajectory
+from improvo.frontend.registry import load_odometry_frontend
+from improvo.odometry.settings import OdometrySettings
+from improvo.odometry.visual_odometry import VisualOdometry
+from improvo.sequences import open_sequence
+from improvo.types import Features, Trajectory
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 SEQUENCES = ("redkitchen", "hololens-office", "checkerboard-desk", "kitti00", "fr3-notexture")

@@ -11,7 +11,7 @@ from typing import Any
 
 _OPTIONS_HERE = "<!-- options of all commands -->"
 _CARDS_HERE = "<!-- model cards -->"
-_WEIGHTS = Path(__file__).parents[1] / "src" / "sivo" / "frontend" / "weights"
+_WEIGHTS = Path(__file__).parents[1] / "src" / "improvo" / "frontend" / "weights"
 
 
 def on_config(config: Any) -> Any:
@@ -25,7 +25,7 @@ def on_config(config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Put what `sivo VERB --help` prints, and the cards of the bundled weights, where a page asks for them."""
+    """Put what `improvo VERB --help` prints, and the cards of the bundled weights, where a page asks for them."""
     for mark, lines in ((_OPTIONS_HERE, _help_texts), (_CARDS_HERE, _model_cards)):
         if mark in markdown:
             markdown = markdown.replace(mark, "\n".join(lines()))
@@ -40,7 +40,7 @@ def _pages(nav: Any) -> list[str]:
 
 
 def _help_texts() -> list[str]:
-    from sivo.cli.main import COMMANDS, main
+    from improvo.cli.main import COMMANDS, main
 
     lines = []
     for verb in COMMANDS:
@@ -48,7 +48,7 @@ def _help_texts() -> list[str]:
             text = io.StringIO()
             with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
                 main([*words, "--help"])
-            lines += [f"### `sivo {' '.join(words)}`", "", "```text", text.getvalue().strip(), "```", ""]
+            lines += [f"### `improvo {' '.join(words)}`", "", "```text", text.getvalue().strip(), "```", ""]
     return lines
 
 
@@ -56,10 +56,10 @@ def _subcommands(verb: str) -> list[str]:
     """The sub-commands of a verb, in their order."""
     import importlib
 
-    from sivo.cli.main import COMMANDS
+    from improvo.cli.main import COMMANDS
 
     parser = argparse.ArgumentParser()
-    importlib.import_module(f"sivo.cli.{COMMANDS[verb][0]}").add_arguments(parser)
+    importlib.import_module(f"improvo.cli.{COMMANDS[verb][0]}").add_arguments(parser)
     actions = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
     return [name for action in actions for name in action.choices]
 

@@ -1,7 +1,7 @@
 """Put trained weights into the package, with what was measured: python recipes/bundle.py WEIGHTS NAME [POSE.json ...]
 
-The figures of `sivo evaluate pose` (rows of that label) go into the model card, and activation ranges over the pictures
-of --calibrate, which the int8 runtime needs.
+The figures of `improvo evaluate pose` (rows of that label) go into the model card, and activation ranges over the
+pictures of --calibrate, which the int8 runtime needs.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sivo.cli.train_homographies import read_data_card
-from sivo.frontend.calibration import calibrate
-from sivo.frontend.weights import BUNDLED, Weights, load_weights, save_weights
+from improvo.cli.train_homographies import read_data_card
+from improvo.frontend.calibration import calibrate
+from improvo.frontend.weights import BUNDLED, Weights, load_weights, save_weights
 
 NO_HEAD = "The stability head is not part of these weights: only VO adaptation can teach it. "
 ATTRIBUTION = (

@@ -1,7 +1,7 @@
 """The bundled weights, from pictures to model card: python recipes/superpoint.py PICTURES... -o OUT
 
-Needs torch, NumPy, OpenCV and sivo itself; runs on a CPU or a GPU (torchrun for several processes), and continues where
-it was stopped. Three trainings, all of them `sivo train homographies`:
+Needs torch, NumPy, OpenCV and improvo itself; runs on a CPU or a GPU (torchrun for several processes), and continues
+where it was stopped. Three trainings, all of them `improvo train homographies`:
 
 1. small: half width from scratch at a constant learning rate; detector labels are Shi-Tomasi corners under homographic
    adaptation. Half width sees three times as many pictures in the same time, when there is most to learn.
@@ -20,11 +20,11 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from sivo.cli.train_homographies import read_data_card
-from sivo.errors import SivoError
-from sivo.training.settings import HomographiesSettings
-from sivo.training.share import Share
-from sivo.training.stages import train_homographies
+from improvo.cli.train_homographies import read_data_card
+from improvo.errors import ImprovoError
+from improvo.training.settings import HomographiesSettings
+from improvo.training.share import Share
+from improvo.training.stages import train_homographies
 
 HERE = Path(__file__).parent
 
@@ -81,5 +81,5 @@ def main() -> int:
 if __name__ == "__main__":
     try:
         sys.exit(main())
-    except SivoError as error:
+    except ImprovoError as error:
         sys.exit(f"recipe: {error}")

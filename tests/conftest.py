@@ -20,10 +20,10 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The output folder of a real `sivo run` over 30 pictures of a textured room; not to be written to."""
+    """The output folder of a real `improvo run` over 30 pictures of a textured room; not to be written to."""
     from rendered_walk import write_walk
 
-    from sivo.cli.main import main
+    from improvo.cli.main import main
 
     folder = tmp_path_factory.mktemp("finished")
     walk = write_walk(folder / "walk", frames=30)

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from sivo.geometry.camera import Camera
-from sivo.geometry.se3 import inverse, rigid, so3_exp, transform
-from sivo.types import Features, Float32, Float64, Frame, Trajectory
+from improvo.geometry.camera import Camera
+from improvo.geometry.se3 import inverse, rigid, so3_exp, transform
+from improvo.types import Features, Float32, Float64, Frame, Trajectory
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 NORMAL, OFFSET = np.array([-0.3, 0.1, 1.0]), 2.0  # plane: NORMAL . X = OFFSET
@@ -19,7 +19,7 @@ NORMAL, OFFSET = np.array([-0.3, 0.1, 1.0]), 2.0  # plane: NORMAL . X = OFFSET
 
 @dataclass
 class PlaneSequence:
-    """Looks like `sivo.sequences.Sequence`."""
+    """Looks like `improvo.sequences.Sequence`."""
 
     frames: int = 20
     name: str = "plane"
@@ -54,7 +54,7 @@ class PlaneSequence:
 
     def __getitem__(self, i: int) -> Frame:
         if i in self.unreadable:
-            from sivo.errors import InputError
+            from improvo.errors import InputError
 
             raise InputError(f"frame {i}: cannot be decoded")
         image = np.random.default_rng(i).integers(0, 255, (CAMERA.height, CAMERA.width)).astype(np.uint8)

@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from sivo.evaluation.settings import SurvivalSettings
-from sivo.files import make_output_folder, write_json
-from sivo.frontend.weights import Weights, find_weights, load_weights, save_weights
-from sivo.improvement.improve import Improvement, improve
-from sivo.improvement.settings import HeldBackSettings, ImproveSettings, JudgeSettings
-from sivo.labeling.settings import LabelSettings
-from sivo.odometry.run_settings import FrontendSettings
-from sivo.odometry.settings import OdometrySettings, StartSettings
-from sivo.training.settings import OdometryTrainingSettings
+from improvo.evaluation.settings import SurvivalSettings
+from improvo.files import make_output_folder, write_json
+from improvo.frontend.weights import Weights, find_weights, load_weights, save_weights
+from improvo.improvement.improve import Improvement, improve
+from improvo.improvement.settings import HeldBackSettings, ImproveSettings, JudgeSettings
+from improvo.labeling.settings import LabelSettings
+from improvo.odometry.run_settings import FrontendSettings
+from improvo.odometry.settings import OdometrySettings, StartSettings
+from improvo.training.settings import OdometryTrainingSettings
 
 SPOILED = "spoiled"  # stands for bundled weights with so much noise that a sixth of the matches is lost
 SETTINGS = ImproveSettings(

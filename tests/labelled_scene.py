@@ -8,16 +8,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sivo.config import to_dict
-from sivo.geometry.camera import Camera
-from sivo.labeling.frames import FRAMES_FILE, FramesTable, pack_images, write_frames
-from sivo.labeling.settings import LabelSettings
-from sivo.labeling.stability import IGNORE, STABLE, UNSTABLE
-from sivo.labeling.store import DONE, LabelStore, SequenceRecord
-from sivo.labeling.tables import POINTS_FILE, TRACKS_FILE, PointsTable, PointsWriter, TracksWriter
-from sivo.sequences import write_trajectory
-from sivo.sequences.base import SequenceSettings
-from sivo.types import Float64, Trajectory
+from improvo.config import to_dict
+from improvo.geometry.camera import Camera
+from improvo.labeling.frames import FRAMES_FILE, FramesTable, pack_images, write_frames
+from improvo.labeling.settings import LabelSettings
+from improvo.labeling.stability import IGNORE, STABLE, UNSTABLE
+from improvo.labeling.store import DONE, LabelStore, SequenceRecord
+from improvo.labeling.tables import POINTS_FILE, TRACKS_FILE, PointsTable, PointsWriter, TracksWriter
+from improvo.sequences import write_trajectory
+from improvo.sequences.base import SequenceSettings
+from improvo.types import Float64, Trajectory
 
 CAMERA = Camera(width=160, height=120, fx=120.0, fy=120.0, cx=79.5, cy=59.5)
 FRAMES = 40

@@ -6,9 +6,9 @@ from itertools import product
 
 import numpy as np
 
-from sivo.frontend.architecture import Architecture
-from sivo.frontend.weights import ModelCard, Weights, expected_shapes
-from sivo.types import Float32
+from improvo.frontend.architecture import Architecture
+from improvo.frontend.weights import ModelCard, Weights, expected_shapes
+from improvo.types import Float32
 
 TINY = Architecture("tiny", encoder=(4, 4, 6, 6, 8, 8, 8, 8), head=12, descriptor=16)
 

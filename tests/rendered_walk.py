@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from simulated_features import hand_motion
 
-from sivo.geometry import se3
-from sivo.geometry.camera import Camera
-from sivo.types import Float64, UInt8
+from improvo.geometry import se3
+from improvo.geometry.camera import Camera
+from improvo.types import Float64, UInt8
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 

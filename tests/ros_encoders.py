@@ -15,8 +15,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
+from improvo.geometry.se3 import quat_xyzw_from_rotation
 from sequence_encoders import Scene, png
-from sivo.geometry.se3 import quat_xyzw_from_rotation
 
 
 class BagWriter:

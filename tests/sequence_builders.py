@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sivo.geometry.camera import Camera
-from sivo.geometry.se3 import rigid, so3_exp
-from sivo.sequences.tum_rgbd import TumRgbdWriter
-from sivo.types import Float64, UInt8
+from improvo.geometry.camera import Camera
+from improvo.geometry.se3 import rigid, so3_exp
+from improvo.sequences.tum_rgbd import TumRgbdWriter
+from improvo.types import Float64, UInt8
 
 CAMERA = Camera(96, 72, 90.0, 91.0, 47.0, 36.5)
 

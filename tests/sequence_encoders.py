@@ -11,11 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sivo.geometry.camera import Camera
-from sivo.geometry.se3 import inverse, quat_xyzw_from_rotation
-from sivo.sequences.calibration import calibration_yaml
-from sivo.sequences.tum_rgbd import TumRgbdWriter
-from sivo.types import Float64, UInt8
+from improvo.geometry.camera import Camera
+from improvo.geometry.se3 import inverse, quat_xyzw_from_rotation
+from improvo.sequences.calibration import calibration_yaml
+from improvo.sequences.tum_rgbd import TumRgbdWriter
+from improvo.types import Float64, UInt8
 
 _CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 

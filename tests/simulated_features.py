@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sivo.geometry import se3
-from sivo.geometry.camera import Camera
-from sivo.types import Features, Float64
+from improvo.geometry import se3
+from improvo.geometry.camera import Camera
+from improvo.types import Features, Float64
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sivo.backend import BundleProblem, ObjectiveSettings
-from sivo.backend.arrange import arrange
-from sivo.backend.linearise import errors_and_depths, evaluate, linearise
-from sivo.backend.objective import cost, huber, huber_slope, reprojection_errors, residuals
-from sivo.backend.reference import normal_equations
-from sivo.backend.simulated import simulated_window
-from sivo.errors import ConfigError
+from improvo.backend import BundleProblem, ObjectiveSettings
+from improvo.backend.arrange import arrange
+from improvo.backend.linearise import errors_and_depths, evaluate, linearise
+from improvo.backend.objective import cost, huber, huber_slope, reprojection_errors, residuals
+from improvo.backend.reference import normal_equations
+from improvo.backend.simulated import simulated_window
+from improvo.errors import ConfigError
 
 # depths of 1.5 to 4.5: with these limits both sides of the depth regulariser are at work
 TIGHT_DEPTHS = ObjectiveSettings(huber_width=1.0, depth_min=2.0, depth_max=3.0, depth_weight=3.0)

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sivo.backend import BundleProblem, ObjectiveSettings, SolverSettings, solve
-from sivo.backend.arrange import CHUNK, arrange
-from sivo.backend.eliminate import eliminate
-from sivo.backend.linearise import linearise
-from sivo.backend.objective import cost
-from sivo.backend.reduced import solve_step
-from sivo.backend.reference import normal_equations, solve_dense
-from sivo.backend.simulated import simulated_window
-from sivo.geometry import se3
-from sivo.geometry.alignment import align_points
+from improvo.backend import BundleProblem, ObjectiveSettings, SolverSettings, solve
+from improvo.backend.arrange import CHUNK, arrange
+from improvo.backend.eliminate import eliminate
+from improvo.backend.linearise import linearise
+from improvo.backend.objective import cost
+from improvo.backend.reduced import solve_step
+from improvo.backend.reference import normal_equations, solve_dense
+from improvo.backend.simulated import simulated_window
+from improvo.geometry import se3
+from improvo.geometry.alignment import align_points
 
 TO_THE_END = SolverSettings(relative_decrease=1e-14, max_iterations=200)
 

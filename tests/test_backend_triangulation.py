@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from sivo.backend import TriangulationSettings, triangulate_tracks
-from sivo.backend.simulated import simulated_window
-from sivo.errors import ConfigError
+from improvo.backend import TriangulationSettings, triangulate_tracks
+from improvo.backend.simulated import simulated_window
+from improvo.errors import ConfigError
 
 LOSSES = ("huber", "geman_mcclure")
 
@@ -146,12 +146,12 @@ def test_impossible_settings_are_refused():
 
 
 def test_settings_and_problems_import_without_numba():
-    code = "import sys, sivo.backend; sivo.backend.ObjectiveSettings(); sys.exit('numba' in sys.modules)"
+    code = "import sys, improvo.backend; improvo.backend.ObjectiveSettings(); sys.exit('numba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_kernels_compile_ahead_of_time():
-    from sivo.backend.compile import compile_kernels, kernels_are_cached
+    from improvo.backend.compile import compile_kernels, kernels_are_cached
 
     compile_kernels()
     said: list[str] = []
@@ -163,7 +163,7 @@ def test_kernels_compile_ahead_of_time():
 def test_kernels_work_where_nothing_can_be_cached(monkeypatch):
     from numba import njit
 
-    from sivo.backend import compiled as module
+    from improvo.backend import compiled as module
 
     def no_writable_folder(**options):
         if options.pop("cache", False):

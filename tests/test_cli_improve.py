@@ -1,4 +1,4 @@
-"""`sivo improve` as a user meets it: what it says, and one line for what it cannot work with."""
+"""`improvo improve` as a user meets it: what it says, and one line for what it cannot work with."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import yaml
 from rendered_walk import write_walk
 
 from improvement_example import FakeTraining
-from sivo import config
-from sivo.cli.main import main
-from sivo.improvement.settings import ImproveSettings
+from improvo import config
+from improvo.cli.main import main
+from improvo.improvement.settings import ImproveSettings
 
 OPTIONS = [
     *("--frontend", "superpoint-small", "--max-keypoints", "250", "--set", "labels.min_observations=6"),
@@ -33,7 +33,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def training(monkeypatch: pytest.MonkeyPatch) -> FakeTraining:
     """In place of the real training, which has a test of its own."""
     fake = FakeTraining()
-    monkeypatch.setattr("sivo.improvement.improve._train_odometry", fake)
+    monkeypatch.setattr("improvo.improvement.improve._train_odometry", fake)
     return fake
 
 
@@ -41,7 +41,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     capsys.readouterr()
     assert main(["improve", *map(str, words), *OPTIONS]) == 2
     message = capsys.readouterr().err.strip().splitlines()[-1]
-    assert message.startswith("sivo: ")
+    assert message.startswith("improvo: ")
     return message
 
 

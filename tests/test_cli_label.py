@@ -1,4 +1,4 @@
-"""`sivo label` as a user meets it: resumable, the same for any number of workers, one failure spoils no other."""
+"""`improvo label` as a user meets it: resumable, the same for any number of workers, one failure spoils no other."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ import pyarrow.parquet as pq
 import pytest
 from rendered_walk import write_walk
 
-from sivo.cli.main import main
-from sivo.labeling.labelled import read_labels
-from sivo.labeling.stability import STABLE
+from improvo.cli.main import main
+from improvo.labeling.labelled import read_labels
+from improvo.labeling.stability import STABLE
 
 OPTIONS = ["--frontend", "orb", "--max-keypoints", "300", "--set", "labels.min_observations=6"]
 
@@ -85,7 +85,7 @@ def test_other_settings_are_refused_in_one_line(
     capsys.readouterr()
     assert main(["label", str(walks[0]), "-o", str(labelled), "--frontend", "orb", "--max-keypoints", "301"]) == 2
     message = capsys.readouterr().err.strip()
-    assert message.startswith("sivo: ")
+    assert message.startswith("improvo: ")
     assert "--relabel" in message
     assert "\n" not in message
 
@@ -115,7 +115,7 @@ def test_packed_frames_need_no_recording(walks: list[Path], tmp_path: Path) -> N
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 def test_a_killed_run_resumes_to_the_same_labels(labelled: Path, walks: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "labels"
-    command = [sys.executable, "-m", "sivo", "label", *map(str, walks[:2]), "-o", str(out), *OPTIONS]
+    command = [sys.executable, "-m", "improvo", "label", *map(str, walks[:2]), "-o", str(out), *OPTIONS]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60

@@ -1,4 +1,4 @@
-"""What `sivo label` says of recordings that cannot be labelled, or not all of them; the rest is finished."""
+"""What `improvo label` says of recordings that cannot be labelled, or not all of them; the rest is finished."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from rendered_walk import write_walk
 
-from sivo.cli.main import main
-from sivo.labeling.labelled import read_labels
-from sivo.labeling.store import DONE, SequenceRecord, read_records
+from improvo.cli.main import main
+from improvo.labeling.labelled import read_labels
+from improvo.labeling.store import DONE, SequenceRecord, read_records
 
 OPTIONS = ["--frontend", "orb", "--max-keypoints", "200", "--set", "labels.min_observations=6"]
 FRAMES = 26
@@ -119,7 +119,7 @@ def test_a_full_disk_fails_what_does_not_fit_and_finishes_the_rest(store: Path, 
     limit = (store / "torn" / "tracks.parquet").stat().st_size * 4 // 3  # `good` has one frame more
     store = tmp_path / "labels"
     run = subprocess.run(
-        [sys.executable, "-m", "sivo", "label", str(longer), str(good), "-o", str(store), *OPTIONS],
+        [sys.executable, "-m", "improvo", "label", str(longer), str(good), "-o", str(store), *OPTIONS],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
         capture_output=True,

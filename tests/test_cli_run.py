@@ -1,4 +1,4 @@
-"""`sivo run` as a user meets it: what it leaves, and one line with the mend for every bad input."""
+"""`improvo run` as a user meets it: what it leaves, and one line with the mend for every bad input."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 from rendered_walk import CAMERA, write_walk
 
-from sivo.cli.main import main
-from sivo.labeling.tables import read_points, read_tracks
-from sivo.sequences import read_trajectory
+from improvo.cli.main import main
+from improvo.labeling.tables import read_points, read_tracks
+from improvo.sequences import read_trajectory
 
 CAMERA_TEXT = f"{CAMERA.fx},{CAMERA.fy},{CAMERA.cx},{CAMERA.cy}"
 
@@ -43,7 +43,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     capsys.readouterr()
     assert main(["run", *words]) == 2
     message = capsys.readouterr().err.strip()
-    assert message.startswith("sivo: ")
+    assert message.startswith("improvo: ")
     assert "\n" not in message
     return message
 
@@ -125,7 +125,7 @@ def test_an_interrupt_leaves_a_valid_partial_result(walk: Path, tmp_path: Path) 
         (long / f"{i:06d}.png").symlink_to(path)
     (long / "camera.yaml").write_bytes((walk / "camera.yaml").read_bytes())
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "sivo", "run", str(long), "-o", str(out), "--frontend", "orb"]
+    command = [sys.executable, "-m", "improvo", "run", str(long), "-o", str(out), "--frontend", "orb"]
     # a shell's background job hands SIGINT down as ignored, and Python then leaves it so
     heed_interrupts = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     with subprocess.Popen(

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from sivo import config
-from sivo.errors import ConfigError, OutputError
-from sivo.files import MARKER, check_output_folder, make_output_folder, write_json, write_text, written_atomically
+from improvo import config
+from improvo.errors import ConfigError, OutputError
+from improvo.files import MARKER, check_output_folder, make_output_folder, write_json, write_text, written_atomically
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def test_our_own_folder_may_be_written_again_and_no_other(tmp_path: Path) -> Non
     make_output_folder(ours, "run")
     make_output_folder(ours, "run")
     assert (ours / MARKER).exists()
-    with pytest.raises(OutputError, match="sivo run"):
+    with pytest.raises(OutputError, match="improvo run"):
         check_output_folder(ours, "label")
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="is a file"):

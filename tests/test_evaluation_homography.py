@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from sivo.cli.main import main
-from sivo.errors import InputError
-from sivo.evaluation.homography import average_precision, evaluate_pair
-from sivo.evaluation.homography_pairs import hpatches_scenes, open_scene, picture_scenes
-from sivo.evaluation.settings import HomographySettings
-from sivo.training.views import inside, warp_points
-from sivo.types import Features, Float64
+from improvo.cli.main import main
+from improvo.errors import InputError
+from improvo.evaluation.homography import average_precision, evaluate_pair
+from improvo.evaluation.homography_pairs import hpatches_scenes, open_scene, picture_scenes
+from improvo.evaluation.settings import HomographySettings
+from improvo.training.views import inside, warp_points
+from improvo.types import Features, Float64
 
 SETTINGS = HomographySettings()
 SHAPE = (240, 320)

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from evaluation_scene import CAMERA, PlaneFeatures, PlaneSequence, PlaneSource
-from sivo.cli.main import main
-from sivo.errors import ConfigError, InputError
-from sivo.evaluation.depth import depth_at
-from sivo.evaluation.estimators import with_opencv, with_poselib
-from sivo.evaluation.measures import PairGeometry, PoseError, repeated_keypoints, right_matches
-from sivo.evaluation.pairs import draw_pairs, pairs_of_sequence
-from sivo.evaluation.parallel import Workers
-from sivo.evaluation.pose_results import results
-from sivo.evaluation.pose_run import run_pose_protocol
-from sivo.evaluation.settings import PoseSettings
-from sivo.evaluation.statistics import Bootstrap, accuracy_curve, area_shares, below
-from sivo.evaluation.tables import pose_tables
-from sivo.geometry.se3 import inverse, rigid, so3_exp
+from improvo.cli.main import main
+from improvo.errors import ConfigError, InputError
+from improvo.evaluation.depth import depth_at
+from improvo.evaluation.estimators import with_opencv, with_poselib
+from improvo.evaluation.measures import PairGeometry, PoseError, repeated_keypoints, right_matches
+from improvo.evaluation.pairs import draw_pairs, pairs_of_sequence
+from improvo.evaluation.parallel import Workers
+from improvo.evaluation.pose_results import results
+from improvo.evaluation.pose_run import run_pose_protocol
+from improvo.evaluation.settings import PoseSettings
+from improvo.evaluation.statistics import Bootstrap, accuracy_curve, area_shares, below
+from improvo.evaluation.tables import pose_tables
+from improvo.geometry.se3 import inverse, rigid, so3_exp
 
 SETTINGS = PoseSettings(gaps=(3, 8), pairs=6, resamples=200)
 
@@ -339,5 +339,5 @@ def test_bad_sequences_on_the_command_line_exit_2(
 ) -> None:
     assert main(["evaluate", "pose", str(shared_data / name), "--frontend", "orb", "--workers", "1"]) == 2
     error = capsys.readouterr().err.strip().splitlines()[-1]
-    assert error.startswith("sivo: ")
+    assert error.startswith("improvo: ")
     assert name in error

@@ -1,4 +1,4 @@
-"""`sivo evaluate stability`: measures on known numbers, and the whole command on labels whose causes are known."""
+"""`improvo evaluate stability`: measures on known numbers, and the whole command on labels whose causes are known."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
-from sivo.cli.main import main
-from sivo.errors import InputError
-from sivo.evaluation.causes import PRECEDENCE, TrueCauses, track_causes
-from sivo.evaluation.stability import average_precision, median_errors, paired_folders, roc_auc
-from sivo.evaluation.true_errors import true_track_errors
-from sivo.geometry.camera import Camera
-from sivo.geometry.se3 import inverse, rigid, transform
-from sivo.labeling.stability import label_stability
-from sivo.labeling.tables import PointsWriter, TracksWriter
-from sivo.sequences.tum_rgbd import TumRgbdWriter
-from sivo.simulation import bundled_sequence
-from sivo.types import Tracks
+from improvo.cli.main import main
+from improvo.errors import InputError
+from improvo.evaluation.causes import PRECEDENCE, TrueCauses, track_causes
+from improvo.evaluation.stability import average_precision, median_errors, paired_folders, roc_auc
+from improvo.evaluation.true_errors import true_track_errors
+from improvo.geometry.camera import Camera
+from improvo.geometry.se3 import inverse, rigid, transform
+from improvo.labeling.stability import label_stability
+from improvo.labeling.tables import PointsWriter, TracksWriter
+from improvo.sequences.tum_rgbd import TumRgbdWriter
+from improvo.simulation import bundled_sequence
+from improvo.types import Tracks
 
 CODES = {"static": 0, "moving": 1, "highlight": 2, "shadow_edge": 3, "depth_discontinuity": 4, "repeated_texture": 5}
 CAMERA = Camera(96, 64, 80.0, 80.0, 47.5, 31.5)
@@ -170,7 +170,7 @@ def test_what_does_not_belong_together_is_refused(
     simulation: Path, labels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["evaluate", "stability", str(labels), str(labels)]) == 2
-    assert "sivo simulate" in capsys.readouterr().err
+    assert "improvo simulate" in capsys.readouterr().err
     assert main(["evaluate", "stability", str(tmp_path / "nothing"), str(simulation)]) == 2
     assert "points.parquet" in capsys.readouterr().err
     with pytest.raises(InputError):

@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sivo.errors import ConfigError, InputError
-from sivo.evaluation.relative import window_pairs
-from sivo.evaluation.settings import TrajectorySettings
-from sivo.evaluation.trajectory import associate, clean_truth, evaluate_trajectory
-from sivo.geometry.alignment import Similarity
-from sivo.geometry.se3 import nearest_rotation, rigid, so3_exp
-from sivo.sequences.trajectory_files import read_trajectory
-from sivo.types import Float64, Trajectory
+from improvo.errors import ConfigError, InputError
+from improvo.evaluation.relative import window_pairs
+from improvo.evaluation.settings import TrajectorySettings
+from improvo.evaluation.trajectory import associate, clean_truth, evaluate_trajectory
+from improvo.geometry.alignment import Similarity
+from improvo.geometry.se3 import nearest_rotation, rigid, so3_exp
+from improvo.sequences.trajectory_files import read_trajectory
+from improvo.types import Float64, Trajectory
 
 RNG_SEED = 7
 
@@ -212,7 +212,7 @@ def evo(program: str, layout: str, truth: Path, estimate: Path, options: list[st
     """Statistics that evo prints, run as a separate program (it is GPL and never imported)."""
     executable = shutil.which(program) or shutil.which(program, path=str(Path(sys.executable).parent))
     if executable is None:
-        pytest.skip(f"needs {program} on the PATH (pip install evo), run beside sivo as a program")
+        pytest.skip(f"needs {program} on the PATH (pip install evo), run beside improvo as a program")
     out.unlink(missing_ok=True)
     command = [executable, layout, str(truth), str(estimate), *options, "--save_results", str(out), "--no_warnings"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -10,12 +10,12 @@ import pytest
 from rendered_walk import write_walk
 from simulated_features import CAMERA, hand_motion, nothing_to_see, observe, room
 
-from sivo.errors import ConfigError
-from sivo.evaluation.settings import SurvivalSettings
-from sivo.evaluation.unlabelled import agreeing_matches, spread_pairs, surviving_matches, usable_gaps
-from sivo.frontend.registry import load_frontend
-from sivo.sequences import open_sequence
-from sivo.types import Features
+from improvo.errors import ConfigError
+from improvo.evaluation.settings import SurvivalSettings
+from improvo.evaluation.unlabelled import agreeing_matches, spread_pairs, surviving_matches, usable_gaps
+from improvo.frontend.registry import load_frontend
+from improvo.sequences import open_sequence
+from improvo.types import Features
 
 SETTINGS = SurvivalSettings()
 

@@ -1,4 +1,4 @@
-"""`sivo evaluate trajectory` and `sivo evaluate vo`: files in, tables out, errors in one line."""
+"""`improvo evaluate trajectory` and `improvo evaluate vo`: files in, tables out, errors in one line."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from evaluation_scene import CAMERA, PlaneFeatures, PlaneSequence
-from sivo.cli.main import main
-from sivo.errors import InputError
-from sivo.evaluation import vo
-from sivo.evaluation.settings import TrajectorySettings
-from sivo.evaluation.trajectory_tables import vo_tables
-from sivo.evaluation.vo import WITH, WITHOUT, evaluate_vo, usable
-from sivo.frontend import Frontend
-from sivo.geometry.se3 import rigid, so3_exp
-from sivo.odometry.settings import OdometrySettings
-from sivo.sequences.trajectory_files import write_trajectory
-from sivo.types import Features, Frame, Trajectory, UInt8
+from improvo.cli.main import main
+from improvo.errors import InputError
+from improvo.evaluation import vo
+from improvo.evaluation.settings import TrajectorySettings
+from improvo.evaluation.trajectory_tables import vo_tables
+from improvo.evaluation.vo import WITH, WITHOUT, evaluate_vo, usable
+from improvo.frontend import Frontend
+from improvo.geometry.se3 import rigid, so3_exp
+from improvo.odometry.settings import OdometrySettings
+from improvo.sequences.trajectory_files import write_trajectory
+from improvo.types import Features, Frame, Trajectory, UInt8
 
 
 def trajectory(seconds: float = 6.0) -> Trajectory:

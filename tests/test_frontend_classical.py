@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from sivo.errors import ConfigError
-from sivo.frontend.classical import spread_over_image
-from sivo.frontend.registry import CLASSICAL, load_frontend, load_odometry_frontend
-from sivo.types import UInt8
+from improvo.errors import ConfigError
+from improvo.frontend.classical import spread_over_image
+from improvo.frontend.registry import CLASSICAL, load_frontend, load_odometry_frontend
+from improvo.types import UInt8
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from improvo.frontend.architecture import Architecture
+from improvo.frontend.live_channels import with_dead_channels, without_dead_channels
+from improvo.frontend.network import NetworkFrontend, prepare
+from improvo.frontend.settings import NetworkSettings
+from improvo.frontend.weights import ModelCard, Weights, load_weights, save_weights
 from network_examples import TINY, random_weights
-from sivo.frontend.architecture import Architecture
-from sivo.frontend.live_channels import with_dead_channels, without_dead_channels
-from sivo.frontend.network import NetworkFrontend, prepare
-from sivo.frontend.settings import NetworkSettings
-from sivo.frontend.weights import ModelCard, Weights, load_weights, save_weights
 
 WIDE = dataclasses.replace(TINY, name="wide", encoder=(8, 8, 8, 8, 8, 8, 8, 8))
 
@@ -52,7 +52,7 @@ def test_the_wide_network_computes_what_the_narrow_one_does(runtime: str) -> Non
 
 def test_torch_computes_the_same_with_the_dead_channels_in_place() -> None:
     torch = pytest.importorskip("torch")
-    from sivo.frontend.runtime_torch import load_network
+    from improvo.frontend.runtime_torch import load_network
 
     narrow, wide = padded("before_relu")
     image = torch.from_numpy(prepare(picture())[None, None])
@@ -63,8 +63,8 @@ def test_torch_computes_the_same_with_the_dead_channels_in_place() -> None:
 
 def test_training_keeps_dead_channels_out_and_saves_the_published_widths(tmp_path: Path, monkeypatch) -> None:
     torch = pytest.importorskip("torch")
-    from sivo.training import stages
-    from sivo.training.settings import HomographiesSettings
+    from improvo.training import stages
+    from improvo.training.settings import HomographiesSettings
 
     full = Architecture("full", encoder=(8, 8, 8, 8, 8, 8, 8, 8), head=8, descriptor=8)
     monkeypatch.setitem(stages.ARCHITECTURES, "full", full)

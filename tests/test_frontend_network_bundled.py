@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from sivo.frontend.network import NetworkFrontend
-from sivo.frontend.settings import NetworkSettings
-from sivo.frontend.weights import BUNDLED, bundled_names, find_weights, load_weights
-from sivo.types import Float32, UInt8
+from improvo.frontend.network import NetworkFrontend
+from improvo.frontend.settings import NetworkSettings
+from improvo.frontend.weights import BUNDLED, bundled_names, find_weights, load_weights
+from improvo.types import Float32, UInt8
 
 SETTINGS = NetworkSettings(max_keypoints=150, precision="float32")
 pytestmark = pytest.mark.skipif(not bundled_names(), reason=f"no weights are bundled yet in {BUNDLED}")

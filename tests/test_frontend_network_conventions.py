@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from improvo.errors import ConfigError, InputError
+from improvo.frontend.corners import refine_to_corners
+from improvo.frontend.decoding import find_keypoints, refine, sample_descriptors
+from improvo.frontend.network import NetworkFrontend
+from improvo.frontend.settings import NetworkSettings
+from improvo.types import UInt8
 from network_examples import brightness_weights, lit_pixel_weights, random_weights
-from sivo.errors import ConfigError, InputError
-from sivo.frontend.corners import refine_to_corners
-from sivo.frontend.decoding import find_keypoints, refine, sample_descriptors
-from sivo.frontend.network import NetworkFrontend
-from sivo.frontend.settings import NetworkSettings
-from sivo.types import UInt8
 
 SIZE = (101, 133)  # height, width: neither a multiple of 8
 
@@ -97,7 +97,7 @@ def test_stability_at_keypoints_is_the_dense_map_there():
 
 def test_descriptors_are_sampled_as_torch_samples_them():
     torch = pytest.importorskip("torch")
-    from sivo.frontend import superpoint
+    from improvo.frontend import superpoint
 
     random = np.random.default_rng(0)
     cells = random.normal(size=(6, 9, 16)).astype(np.float32)

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
+from improvo.cli.main import main
+from improvo.errors import ConfigError, InputError
+from improvo.frontend.architecture import ARCHITECTURES
+from improvo.frontend.calibration import calibrate
+from improvo.frontend.network import NetworkFrontend, prepare
+from improvo.frontend.settings import NetworkSettings
+from improvo.frontend.weights import save_weights
 from network_examples import TINY, lit_pixel_weights, random_weights
-from sivo.cli.main import main
-from sivo.errors import ConfigError, InputError
-from sivo.frontend.architecture import ARCHITECTURES
-from sivo.frontend.calibration import calibrate
-from sivo.frontend.network import NetworkFrontend, prepare
-from sivo.frontend.settings import NetworkSettings
-from sivo.frontend.weights import save_weights
 
 LAYOUTS = ("none", "before_relu", "after_relu")
 # Largest difference between float32 runtimes, relative to the largest value of the map.
@@ -46,8 +46,8 @@ def test_openvino_agrees_with_torch(normalisation):
 
 def test_the_unfolded_network_agrees_too():
     torch = pytest.importorskip("torch")
-    from sivo.frontend.runtime_torch import load_network
-    from sivo.frontend.superpoint import heat_map
+    from improvo.frontend.runtime_torch import load_network
+    from improvo.frontend.superpoint import heat_map
 
     weights = random_weights()
     image = prepare(picture())[None, None]
@@ -63,7 +63,7 @@ def test_the_unfolded_network_agrees_too():
 
 def test_parameter_counts():
     torch = pytest.importorskip("torch")
-    from sivo.frontend.superpoint import SuperPoint
+    from improvo.frontend.superpoint import SuperPoint
 
     def count(architecture):
         return sum(values.numel() for values in SuperPoint(architecture, batch_norm=False).parameters())
@@ -82,7 +82,7 @@ def test_multiplications_are_counted_as_torch_counts_them():
     torch = pytest.importorskip("torch")
     from torch.utils.flop_counter import FlopCounterMode
 
-    from sivo.frontend.superpoint import SuperPoint
+    from improvo.frontend.superpoint import SuperPoint
 
     with FlopCounterMode(display=False) as counter, torch.inference_mode():
         SuperPoint(TINY, batch_norm=False)(torch.zeros(1, 1, 40, 64))
@@ -155,7 +155,7 @@ def test_inference_needs_no_torch(tmp_path):
 import sys
 sys.modules["torch"] = sys.modules["onnx"] = None
 import numpy as np
-from sivo.frontend.registry import load_frontend
+from improvo.frontend.registry import load_frontend
 features = load_frontend({str(path)!r}, max_keypoints=7, border=2)(np.random.default_rng(0).random((40, 50)))
 assert len(features) == 7, len(features)
 """
@@ -197,7 +197,7 @@ def test_exported_onnx_gives_the_same_features(tmp_path, normalisation, subpixel
 def test_exported_onnx_finds_lit_pixels(tmp_path):
     pytest.importorskip("onnx")
     runtime = pytest.importorskip("onnxruntime")
-    from sivo.frontend.onnx_export import export_onnx
+    from improvo.frontend.onnx_export import export_onnx
 
     export_onnx(
         lit_pixel_weights(), tmp_path / "m.onnx", NetworkSettings(max_keypoints=5, subpixel_radius=0, corner_radius=0)

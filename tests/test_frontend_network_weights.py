@@ -9,11 +9,11 @@ import pickle
 import numpy as np
 import pytest
 
+from improvo.cli.main import main
+from improvo.errors import ConfigError, InputError
+from improvo.frontend.network import load_network_frontend
+from improvo.frontend.weights import DataSource, ModelCard, Weights, load_weights, save_weights
 from network_examples import TINY, random_weights
-from sivo.cli.main import main
-from sivo.errors import ConfigError, InputError
-from sivo.frontend.network import load_network_frontend
-from sivo.frontend.weights import DataSource, ModelCard, Weights, load_weights, save_weights
 
 WIDTHS = (6, 6, 6, 6, 10, 10, 10, 10)  # the public networks' pattern, narrower
 HEAD, DESCRIPTOR = 12, 14
@@ -75,8 +75,8 @@ def test_bad_files_are_one_line_errors(saved, tmp_path, capsys):
     from safetensors.numpy import save_file
 
     save_file({"a": np.zeros(3, np.float32)}, tmp_path / "foreign.safetensors")
-    refuse(tmp_path / "foreign.safetensors", "without a sivo model card")
-    save_file({}, tmp_path / "card.safetensors", metadata={"sivo_model_card": '{"architecture": 3}'})
+    refuse(tmp_path / "foreign.safetensors", "without an improvo model card")
+    save_file({}, tmp_path / "card.safetensors", metadata={"improvo_model_card": '{"architecture": 3}'})
     refuse(tmp_path / "card.safetensors", "model card: architecture")
 
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sivo.cli.main import main
-from sivo.errors import ConfigError
-from sivo.frontend.registry import load_odometry_frontend
-from sivo.frontend.stable_only import StableOnly
-from sivo.simulation import bundled_sequence
-from sivo.types import Features
+from improvo.cli.main import main
+from improvo.errors import ConfigError
+from improvo.frontend.registry import load_odometry_frontend
+from improvo.frontend.stable_only import StableOnly
+from improvo.simulation import bundled_sequence
+from improvo.types import Features
 
 
 class Scripted:
@@ -46,7 +46,7 @@ def test_a_frontend_without_the_head_is_one_line(tmp_path: Path, capsys: pytest.
 
 
 def test_the_shipped_head_drops_some_and_keeps_most() -> None:
-    from sivo.sequences import open_sequence
+    from improvo.sequences import open_sequence
 
     image = open_sequence(bundled_sequence())[60].image
     everything, stable = (load_odometry_frontend("superpoint-vo", 500, least) for least in (0.0, 0.3))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sivo.errors import InputError
-from sivo.geometry import se3
-from sivo.geometry.alignment import align_points
-from sivo.geometry.camera import Camera
+from improvo.errors import InputError
+from improvo.geometry import se3
+from improvo.geometry.alignment import align_points
+from improvo.geometry.camera import Camera
 
 CAMERA = Camera(640, 480, 500.0, 510.0, 320.5, 239.0)
 

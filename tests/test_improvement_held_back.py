@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from rendered_walk import write_walk
 
-from sivo.errors import InputError
-from sivo.improvement.held_back import last_part, named, remembered, share_labels, whole_sequences
-from sivo.labeling.store import DONE, FAILED, SequenceRecord, read_records
-from sivo.sequences import SequenceSettings, open_sequence
+from improvo.errors import InputError
+from improvo.improvement.held_back import last_part, named, remembered, share_labels, whole_sequences
+from improvo.labeling.store import DONE, FAILED, SequenceRecord, read_records
+from improvo.sequences import SequenceSettings, open_sequence
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_shared_labels_keep_their_content_and_get_the_name_of_the_new_store(tmp_
         (survey / record.name).mkdir(parents=True)
         (survey / record.name / "points.parquet").write_text(record.path)
         (survey / record.name / "label.json").write_text("{}")
-    for name in (".sivo.json", "settings.yaml"):
+    for name in (".improvo.json", "settings.yaml"):
         (survey / name).write_text("{}")
     held_back = named([Path(both[0].path)], [Path(both[1].path)], SequenceSettings()).held_back
     for _ in range(2):  # again, as after a kill: nothing changes

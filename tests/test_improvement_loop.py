@@ -19,13 +19,13 @@ import pytest
 from rendered_walk import write_walk
 
 from improvement_example import SETTINGS, FakeTraining, run
-from sivo.errors import ConfigError, InputError, OutputError, SivoError
-from sivo.frontend.weights import load_weights
-from sivo.improvement.improve import Improvement
-from sivo.improvement.judgement import Judgement, gain_interval, is_better, read_judgement, rule
-from sivo.improvement.settings import ImproveSettings, JudgeSettings
-from sivo.improvement.telling import Telling
-from sivo.labeling.labelled import read_labels
+from improvo.errors import ConfigError, ImprovoError, InputError, OutputError
+from improvo.frontend.weights import load_weights
+from improvo.improvement.improve import Improvement
+from improvo.improvement.judgement import Judgement, gain_interval, is_better, read_judgement, rule
+from improvo.improvement.settings import ImproveSettings, JudgeSettings
+from improvo.improvement.telling import Telling
+from improvo.labeling.labelled import read_labels
 
 EXAMPLE = Path(__file__).with_name("improvement_example.py")
 LABEL_TABLES = ("tracks.parquet", "points.parquet", "frames.parquet", "trajectory.txt")
@@ -121,7 +121,7 @@ def test_a_finished_run_is_left_as_it_is_and_more_rounds_go_on_from_it(
     assert run(out, [walk], again, rounds=1).best == result.best  # fewer rounds do not undo the others
     assert again.calls == []
     changed = {path.name for path, when in before.items() if path.stat().st_mtime_ns != when}
-    assert changed <= {".sivo.json", "report.html"}
+    assert changed <= {".improvo.json", "report.html"}
 
 
 def test_other_settings_are_refused_and_what_a_kill_left_is_cleared_away(
@@ -188,9 +188,9 @@ def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(wa
 def test_weights_without_activation_ranges_get_them_from_frames_that_are_not_held_back(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sivo.frontend.weights import find_weights, save_weights
-    from sivo.improvement import steps
-    from sivo.improvement.workspace import Workspace
+    from improvo.frontend.weights import find_weights, save_weights
+    from improvo.improvement import steps
+    from improvo.improvement.workspace import Workspace
 
     bundled = load_weights(find_weights("superpoint-small"))
     mine = tmp_path / "mine.safetensors"
@@ -222,7 +222,7 @@ def test_a_run_that_ends_after_each_of_its_steps_goes_on(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from sivo.improvement.steps import Steps
+    from improvo.improvement.steps import Steps
 
     made: list[str] = []
 
@@ -288,12 +288,12 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on_later(
     before, done = resource.getrlimit(resource.RLIMIT_FSIZE), finished[0].weights.parent
     for there in ([], ["start/weights.safetensors", "start/weights.json"]):  # the weights, then the labels do not fit
         out = tmp_path / f"out-{len(there)}"
-        for name in (".sivo.json", "settings.yaml", "split.json", *there):
+        for name in (".improvo.json", "settings.yaml", "split.json", *there):
             (out / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(done / name, out / name)
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
         try:
-            with pytest.raises(SivoError, match=r"cannot be written \(.*File too large\)") as caught:
+            with pytest.raises(ImprovoError, match=r"cannot be written \(.*File too large\)") as caught:
                 run(out, [walk], FakeTraining())
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -12,10 +12,10 @@ from types import SimpleNamespace
 import pytest
 from rendered_walk import write_walk
 
-from sivo.cli.main import main
-from sivo.errors import InputError, MissingExtraError
-from sivo.improvement.executors import Tick, WorkerDiedError
-from sivo.improvement.on_ray import run_on_ray
+from improvo.cli.main import main
+from improvo.errors import InputError, MissingExtraError
+from improvo.improvement.executors import Tick, WorkerDiedError
+from improvo.improvement.on_ray import run_on_ray
 
 
 def halve(number: int, tick: Tick) -> tuple[int, str | None, str]:
@@ -41,7 +41,7 @@ def tick_until_stopped(number: int, tick: Tick) -> None:
 @pytest.fixture(scope="module")
 def cluster():
     """One local cluster for all tests: it takes long to start."""
-    ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'sivo[ray]'")
+    ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'improvo[ray]'")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     python_path = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
     ray.init(
@@ -111,5 +111,5 @@ def test_no_ray_and_no_cluster_are_one_line_errors(monkeypatch):
     with pytest.raises(InputError, match=f"no Ray cluster at {address}"):
         attempt(address)
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'sivo\[ray\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install 'improvo\[ray\]'"):
         attempt(address)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sivo.backend.simulated import simulated_window
-from sivo.errors import ConfigError
-from sivo.labeling.settings import LabelSettings
-from sivo.labeling.stability import IGNORE, STABLE, UNSTABLE, classify, label_stability
-from sivo.types import Tracks
+from improvo.backend.simulated import simulated_window
+from improvo.errors import ConfigError
+from improvo.labeling.settings import LabelSettings
+from improvo.labeling.stability import IGNORE, STABLE, UNSTABLE, classify, label_stability
+from improvo.types import Tracks
 
 
 def simulated_tracks(noise: float = 0.3, seed: int = 0) -> tuple[Tracks, np.ndarray, np.ndarray, np.ndarray]:

@@ -8,10 +8,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from sivo.errors import ConfigError, InputError, OutputError
-from sivo.labeling import frames as frames_module
-from sivo.labeling.frames import FramesTable, PackedImages, pack_images, read_frames, write_frames
-from sivo.labeling.store import DONE, FAILED, LabelStore, SequenceRecord, read_records, sequence_names
+from improvo.errors import ConfigError, InputError, OutputError
+from improvo.labeling import frames as frames_module
+from improvo.labeling.frames import FramesTable, PackedImages, pack_images, read_frames, write_frames
+from improvo.labeling.store import DONE, FAILED, LabelStore, SequenceRecord, read_records, sequence_names
 
 SETTINGS = {"frontend": {"name": "orb", "max_keypoints": 500}, "seed": 0}
 
@@ -126,7 +126,7 @@ def test_packed_frames_come_back_in_any_order(tmp_path, monkeypatch):
 def test_a_killed_run_leaves_no_temporary_file_and_no_doubt(tmp_path):
     folder = tmp_path / "labels"
     folder.mkdir()
-    (folder / "..sivo.json.123.partial.json").write_text("{")  # killed before the folder was marked as ours
+    (folder / "..improvo.json.123.partial.json").write_text("{")  # killed before the folder was marked as ours
     store = LabelStore(folder, SETTINGS)
     finish(store, "kitchen")
     (folder / ".manifest.parquet.123.partial.parquet").write_text("PAR1")
@@ -144,7 +144,7 @@ def test_relabelling_never_leaves_half_a_sequence(tmp_path, monkeypatch):
     def killed(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sivo.labeling.store.make_output_folder", killed)
+    monkeypatch.setattr("improvo.labeling.store.make_output_folder", killed)
     with pytest.raises(KeyboardInterrupt):
         LabelStore(folder, {**SETTINGS, "seed": 1}, relabel=True)
     monkeypatch.undo()

@@ -7,9 +7,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from sivo.errors import InputError, OutputError
-from sivo.labeling import tables
-from sivo.labeling.stability import IGNORE, STABLE, UNSTABLE, TrackLabels
+from improvo.errors import InputError, OutputError
+from improvo.labeling import tables
+from improvo.labeling.stability import IGNORE, STABLE, UNSTABLE, TrackLabels
 
 
 def some_labels(count: int = 5) -> TrackLabels:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sivo.labeling.settings import LabelSettings, TrustSettings
-from sivo.labeling.stability import IGNORE, STABLE, UNSTABLE
-from sivo.labeling.tables import PointsTable, TracksTable
-from sivo.labeling.trust import judge_frames, withhold_labels
+from improvo.labeling.settings import LabelSettings, TrustSettings
+from improvo.labeling.stability import IGNORE, STABLE, UNSTABLE
+from improvo.labeling.tables import PointsTable, TracksTable
+from improvo.labeling.trust import judge_frames, withhold_labels
 
 FRAMES = 60
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from simulated_features import CAMERA, hand_motion, observe, room
 
-from sivo.geometry import se3
-from sivo.odometry.health import HealthCheck, epipolar_errors
-from sivo.odometry.settings import OdometrySettings
-from sivo.odometry.view import View
-from sivo.tracking.matching import unit_descriptors
-from sivo.types import Float64
+from improvo.geometry import se3
+from improvo.odometry.health import HealthCheck, epipolar_errors
+from improvo.odometry.settings import OdometrySettings
+from improvo.odometry.view import View
+from improvo.tracking.matching import unit_descriptors
+from improvo.types import Float64
 
 
 def alarms(estimate: Float64, truth: Float64) -> list[int]:

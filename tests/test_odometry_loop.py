@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from simulated_features import CAMERA, hand_motion, nothing_to_see, observe, room
 
-from sivo.geometry import se3
-from sivo.geometry.alignment import align_points
-from sivo.odometry.journal import FinalView
-from sivo.odometry.settings import OdometrySettings, TrustSettings
-from sivo.odometry.view import View
-from sivo.odometry.visual_odometry import VisualOdometry
-from sivo.types import Features, Float64
+from improvo.geometry import se3
+from improvo.geometry.alignment import align_points
+from improvo.odometry.journal import FinalView
+from improvo.odometry.settings import OdometrySettings, TrustSettings
+from improvo.odometry.view import View
+from improvo.odometry.visual_odometry import VisualOdometry
+from improvo.types import Features, Float64
 
 
 class _NoFrontend:

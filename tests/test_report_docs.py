@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from sivo.cli.main import COMMANDS, main
+from improvo.cli.main import COMMANDS, main
 
 ROOT = Path(__file__).parents[1]
 PAGES = ("index", "tutorial", "commands", "pictures", "export", "conventions", "paper-to-code", "reference")
@@ -26,7 +26,7 @@ def text_of(page: str) -> str:
 
 
 def exists(name: str) -> bool:
-    """Whether `sivo.a.b.C.d` is a module, or a name that a module defines; nothing is imported."""
+    """Whether `improvo.a.b.C.d` is a module, or a name that a module defines; nothing is imported."""
     parts = name.split(".")
     for length in range(len(parts), 0, -1):
         base = ROOT / "src" / Path(*parts[:length])
@@ -49,7 +49,7 @@ def defines(body: list[ast.stmt], names: list[str]) -> bool:
 
 @pytest.mark.parametrize("page", PAGES)
 def test_names_of_modules_and_functions_exist(page: str) -> None:
-    names = set(re.findall(r"(?<![\w/])sivo(?:\.\w+)+", text_of(page)))
+    names = set(re.findall(r"(?<![\w/])improvo(?:\.\w+)+", text_of(page)))
     missing = {name for name in names if not exists(name) and not name.endswith((".yml", ".md"))}
     assert not missing
     if page in ("paper-to-code", "reference"):
@@ -66,7 +66,7 @@ def help_of(words: tuple[str, ...]) -> str:
 
 @pytest.mark.parametrize("page", ["index", "tutorial", "commands", "pictures", "export", "paper-to-code"])
 def test_commands_and_their_options_exist(page: str) -> None:
-    commands = re.findall(r"(?:^|`)(sivo [a-z][^`\n#]*)", text_of(page), flags=re.MULTILINE)
+    commands = re.findall(r"(?:^|`)(improvo [a-z][^`\n#]*)", text_of(page), flags=re.MULTILINE)
     assert len(commands) >= 4 or page == "index"
     for command in commands:
         words = command.split()
@@ -82,7 +82,7 @@ def test_commands_and_their_options_exist(page: str) -> None:
 
 @pytest.mark.skipif(
     importlib.util.find_spec("mkdocs") is None or importlib.util.find_spec("mkdocstrings") is None,
-    reason="needs MkDocs: pip install 'sivo[docs]'",
+    reason="needs MkDocs: pip install 'improvo[docs]'",
 )
 def test_site_builds_without_a_warning(tmp_path: Path) -> None:
     pages = sorted((ROOT / "docs").glob("*.md"))
@@ -96,10 +96,10 @@ def test_site_builds_without_a_warning(tmp_path: Path) -> None:
     )
     assert build.returncode == 0, build.stderr
     commands = (tmp_path / "site" / "commands" / "index.html").read_text()
-    assert "usage: sivo run" in commands
-    assert "usage: sivo export colmap" in commands
+    assert "usage: improvo run" in commands
+    assert "usage: improvo export colmap" in commands
     models = (tmp_path / "site" / "models" / "index.html").read_text()
-    for card in (ROOT / "src" / "sivo" / "frontend" / "weights").glob("*.json"):
+    for card in (ROOT / "src" / "improvo" / "frontend" / "weights").glob("*.json"):
         assert f"<code>{card.stem}</code>" in models
     for page in pages:
         name = "" if page.stem == "index" else page.stem

@@ -15,13 +15,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from sivo.cli.main import main
-from sivo.labeling.tables import read_tracks
-from sivo.report.model import segment_model
-from sivo.report.run_folder import RunFolder, read_map
-from sivo.report.trajectory_export import export_trajectory
-from sivo.sequences import open_sequence, read_trajectory
-from sivo.types import Trajectory
+from improvo.cli.main import main
+from improvo.labeling.tables import read_tracks
+from improvo.report.model import segment_model
+from improvo.report.run_folder import RunFolder, read_map
+from improvo.report.trajectory_export import export_trajectory
+from improvo.sequences import open_sequence, read_trajectory
+from improvo.types import Trajectory
 
 
 def test_map_is_read_back_as_it_was_written(finished_run: Path) -> None:
@@ -34,7 +34,7 @@ def test_map_is_read_back_as_it_was_written(finished_run: Path) -> None:
 
 
 def test_a_damaged_map_is_named(finished_run: Path, tmp_path: Path) -> None:
-    from sivo.errors import InputError
+    from improvo.errors import InputError
 
     content = (finished_run / "map.ply").read_bytes()
     for number, damaged in enumerate((b"", b"ply\n", content[:-7], content.replace(b"mean_error", b"other_name"))):
@@ -58,7 +58,7 @@ def test_model_errors_are_those_of_the_table(finished_run: Path) -> None:
 
 
 def test_pycolmap_opens_the_model_and_agrees_on_the_errors(finished_run: Path, tmp_path: Path) -> None:
-    pycolmap = pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'sivo[dev]'")
+    pycolmap = pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'improvo[dev]'")
     assert main(["export", "colmap", str(finished_run), "-o", str(tmp_path / "colmap")]) == 0
     run = RunFolder(finished_run)
     model = segment_model(run, 0)
@@ -101,7 +101,7 @@ def test_trajectory_files_are_read_back(finished_run: Path, tmp_path: Path, form
 
 
 def test_kitti_refuses_a_trajectory_with_gaps(tmp_path: Path) -> None:
-    from sivo.errors import InputError
+    from improvo.errors import InputError
 
     gappy = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
     with pytest.raises(InputError, match="2 have no pose; use tum or euroc"):
@@ -122,7 +122,7 @@ def verified(path: Path) -> str:
 
 
 def test_finished_run_is_recorded_for_rerun_without_a_screen(finished_run: Path, tmp_path: Path) -> None:
-    pytest.importorskip("rerun", reason="needs Rerun: pip install 'sivo[view]'")
+    pytest.importorskip("rerun", reason="needs Rerun: pip install 'improvo[view]'")
     assert main(["show", "live", str(finished_run), "--save", str(tmp_path / "run.rrd")]) == 0
     text = verified(tmp_path / "run.rrd")
     for entity in ("/world/camera/image", "/world/labels", "/world/points", "/world/trajectory", "/plots/tracks"):
@@ -130,7 +130,7 @@ def test_finished_run_is_recorded_for_rerun_without_a_screen(finished_run: Path,
 
 
 def test_run_is_recorded_while_it_goes_on(finished_run: Path, tmp_path: Path) -> None:
-    pytest.importorskip("rerun", reason="needs Rerun: pip install 'sivo[view]'")
+    pytest.importorskip("rerun", reason="needs Rerun: pip install 'improvo[view]'")
     walk, recording = finished_run.parent / "walk", tmp_path / "live.rrd"
     words = ["run", str(walk), "-o", str(tmp_path / "out"), "--frontend", "orb", "--max-frames", "20"]
     assert main([*words, "--save", str(recording)]) == 0
@@ -148,7 +148,7 @@ def test_viewer_without_rerun_names_the_extra(
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert main(["show", "live", str(finished_run)]) == 2
-    assert "pip install 'sivo[view]'" in capsys.readouterr().err
+    assert "pip install 'improvo[view]'" in capsys.readouterr().err
 
 
 def in_two_segments(finished: Path, folder: Path) -> Path:

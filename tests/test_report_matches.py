@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sivo.geometry import se3
-from sivo.geometry.camera import Camera
-from sivo.report.match_picture import carry, paint_matches
-from sivo.types import Features, UInt8
+from improvo.geometry import se3
+from improvo.geometry.camera import Camera
+from improvo.report.match_picture import carry, paint_matches
+from improvo.types import Features, UInt8
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 import pytest
 
-from sivo.cli.main import main
-from sivo.report.charts import line_chart
-from sivo.report.improvement_page import Measure, Round, write_improvement_page
-from sivo.report.page import Page
-from sivo.report.plain_words import ranges, warnings
+from improvo.cli.main import main
+from improvo.report.charts import line_chart
+from improvo.report.improvement_page import Measure, Round, write_improvement_page
+from improvo.report.page import Page
+from improvo.report.plain_words import ranges, warnings
 
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 FLAGS = (
@@ -46,7 +46,7 @@ def browser(tmp_path: Path) -> Iterator[Any]:
     """Headless Chromium."""
     if CHROMIUM is None or DRIVER is None:
         pytest.skip("needs Chromium and ChromeDriver on the PATH (Debian: chromium, chromium-driver)")
-    webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium: pip install 'sivo[dev]'")
+    webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium: pip install 'improvo[dev]'")
     options = webdriver.ChromeOptions()
     options.binary_location = CHROMIUM
     for flag in (*FLAGS, f"--user-data-dir={tmp_path / 'profile'}"):

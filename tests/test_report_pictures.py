@@ -9,17 +9,17 @@ import cv2
 import numpy as np
 import pytest
 
-from sivo.cli.main import main
-from sivo.geometry.se3 import rigid, so3_exp
-from sivo.labeling.stability import STABLE
-from sivo.report.canvas import Canvas
-from sivo.report.overhead import overhead_axes, robust_limits
-from sivo.report.palettes import PALETTES
-from sivo.report.run_folder import RunFolder
-from sivo.report.sheets import write_video
-from sivo.report.stability_picture import suppressed_regions
-from sivo.report.track_pictures import TrackPictureSettings, paint_labels, paint_tracks
-from sivo.types import Float64
+from improvo.cli.main import main
+from improvo.geometry.se3 import rigid, so3_exp
+from improvo.labeling.stability import STABLE
+from improvo.report.canvas import Canvas
+from improvo.report.overhead import overhead_axes, robust_limits
+from improvo.report.palettes import PALETTES
+from improvo.report.run_folder import RunFolder
+from improvo.report.sheets import write_video
+from improvo.report.stability_picture import suppressed_regions
+from improvo.report.track_pictures import TrackPictureSettings, paint_labels, paint_tracks
+from improvo.types import Float64
 
 
 def read(path: Path) -> np.ndarray:

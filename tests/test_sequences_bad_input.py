@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from improvo.errors import ConfigError, ImprovoError, InputError
+from improvo.sequences import open_sequence
+from improvo.sequences.calibration import calibration_yaml
+from improvo.types import Trajectory
 from sequence_builders import CAMERA, images, poses, write_images, write_tum
-from sivo.errors import ConfigError, InputError, SivoError
-from sivo.sequences import open_sequence
-from sivo.sequences.calibration import calibration_yaml
-from sivo.types import Trajectory
 
 
 def folder_of_images(folder: Path, count: int = 9, pattern: str = "{:06d}.png") -> Path:
@@ -22,7 +22,7 @@ def folder_of_images(folder: Path, count: int = 9, pattern: str = "{:06d}.png") 
 
 
 def refused(path: Path, **settings: object) -> str:
-    with pytest.raises(SivoError) as error:
+    with pytest.raises(ImprovoError) as error:
         open_sequence(path, **settings)
     message = str(error.value)
     assert "\n" not in message

@@ -1,4 +1,4 @@
-"""`sivo calibrate`: known cameras are recovered from rendered boards, and sets that cannot give one are refused."""
+"""`improvo calibrate`: known cameras are recovered from rendered boards, and sets that cannot give one are refused."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import cv2
 import numpy as np
 import pytest
 
-from sivo.cli.main import main
-from sivo.errors import InputError
-from sivo.geometry.camera import Camera
-from sivo.geometry.se3 import rigid, so3_exp
-from sivo.sequences.board import Board, _black, parse_board
-from sivo.sequences.calibration import load_calibration
-from sivo.sequences.camera_fit import choose_views, find_views, fit_camera
-from sivo.types import Float64, UInt8
+from improvo.cli.main import main
+from improvo.errors import InputError
+from improvo.geometry.camera import Camera
+from improvo.geometry.se3 import rigid, so3_exp
+from improvo.sequences.board import Board, _black, parse_board
+from improvo.sequences.calibration import load_calibration
+from improvo.sequences.camera_fit import choose_views, find_views, fit_camera
+from improvo.types import Float64, UInt8
 
 CAMERA = Camera(640, 480, 420.0, 424.0, 312.0, 246.0, (-0.28, 0.09, 0.0004, -0.0006))
 BOARD = Board(9, 6, 0.025)

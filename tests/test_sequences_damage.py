@@ -14,10 +14,10 @@ import pytest
 
 import ros_encoders
 import sequence_encoders as encoders
+from improvo.errors import ImprovoError, InputError
+from improvo.sequences import open_sequence
 from sequence_builders import CAMERA, depths, images, poses
 from sequence_encoders import Scene
-from sivo.errors import InputError, SivoError
-from sivo.sequences import open_sequence
 
 COUNT = 5
 
@@ -27,7 +27,7 @@ def scene() -> Scene:
 
 
 def refused(path: Path, **settings: object) -> str:
-    with pytest.raises(SivoError) as error:
+    with pytest.raises(ImprovoError) as error:
         open_sequence(path, **settings)
     message = str(error.value)
     assert "\n" not in message

@@ -13,11 +13,11 @@ import pytest
 
 import ros_encoders
 import sequence_encoders as encoders
+from improvo.geometry.camera import Camera
+from improvo.geometry.se3 import rigid, so3_exp
+from improvo.sequences import Sequence, open_sequence
 from sequence_builders import CAMERA, depths, images, poses
 from sequence_encoders import Scene
-from sivo.geometry.camera import Camera
-from sivo.geometry.se3 import rigid, so3_exp
-from sivo.sequences import Sequence, open_sequence
 
 COUNT = 6
 FPS = 20.0

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
+from improvo.geometry.se3 import inverse, rigid
+from improvo.sequences import SequenceSettings, open_recording, open_sequence
+from improvo.sequences.calibration import calibration_yaml
+from improvo.sequences.tum_rgbd import TumRgbdWriter
+from improvo.types import Trajectory
 from sequence_builders import CAMERA, depths, images, poses, write_images, write_tum
-from sivo.geometry.se3 import inverse, rigid
-from sivo.sequences import SequenceSettings, open_recording, open_sequence
-from sivo.sequences.calibration import calibration_yaml
-from sivo.sequences.tum_rgbd import TumRgbdWriter
-from sivo.types import Trajectory
 
 COUNT = 7
 

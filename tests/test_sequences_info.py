@@ -1,4 +1,4 @@
-"""`sivo info`: what a recording is, what is wrong with it, and what to do."""
+"""`improvo info`: what a recording is, what is wrong with it, and what to do."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
+from improvo.cli.main import main
+from improvo.sequences import SequenceSettings
+from improvo.sequences.calibration import calibration_yaml
+from improvo.sequences.survey import Survey, survey
+from improvo.types import UInt8
 from sequence_builders import CAMERA, images, texture, write_images, write_tum, write_video
-from sivo.cli.main import main
-from sivo.sequences import SequenceSettings
-from sivo.sequences.calibration import calibration_yaml
-from sivo.sequences.survey import Survey, survey
-from sivo.types import UInt8
 
 
 def look(folder: Path, pictures: list[UInt8], times: list[float] | None = None) -> Survey:
@@ -74,7 +74,7 @@ def test_without_or_with_a_wrong_calibration_it_still_looks(tmp_path: Path) -> N
     write_video(tmp_path / "v.avi", images(6))
     findings = survey(tmp_path / "v.avi", SequenceSettings())
     assert findings.facts["camera"] is None
-    assert "sivo calibrate" in said(findings)
+    assert "improvo calibrate" in said(findings)
     (tmp_path / "v.yaml").write_text(calibration_yaml(CAMERA.resized(192, 144)))
     assert "calibrated for 192x144 but the images are 96x72" in said(survey(tmp_path / "v.avi", SequenceSettings()))
 

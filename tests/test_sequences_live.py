@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from improvo.errors import InputError
+from improvo.sequences import live, open_sequence
 from sequence_builders import images, write_video
-from sivo.errors import InputError
-from sivo.sequences import live, open_sequence
 
 
 class FakeCamera:

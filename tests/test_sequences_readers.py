@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sivo.errors import ConfigError, InputError
-from sivo.sequences import Recording, SequenceSettings, open_sequence, opening
-from sivo.sequences.base import UnreadableFrameError
-from sivo.sequences.calibration import Calibration
-from sivo.types import UInt8
+from improvo.errors import ConfigError, InputError
+from improvo.sequences import Recording, SequenceSettings, open_sequence, opening
+from improvo.sequences.base import UnreadableFrameError
+from improvo.sequences.calibration import Calibration
+from improvo.types import UInt8
 
 
 class NumpyStack(Recording):
@@ -80,5 +80,5 @@ def test_readers_that_cannot_be_used_are_one_line_errors(tmp_path: Path) -> None
 
 
 def test_the_group_is_the_documented_one() -> None:
-    assert opening.ENTRY_POINT == "sivo.recordings"
+    assert opening.ENTRY_POINT == "improvo.recordings"
     assert opening._installed() == {}

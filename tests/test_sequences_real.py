@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sivo.sequences import open_sequence
+from improvo.sequences import open_sequence
 
 
 @pytest.mark.parametrize(

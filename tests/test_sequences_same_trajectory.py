@@ -10,11 +10,11 @@ import pytest
 
 import ros_encoders
 import sequence_encoders as encoders
+from improvo.cli.main import main
+from improvo.sequences import open_sequence, read_trajectory
+from improvo.sequences.calibration import calibration_yaml
 from sequence_builders import write_video
 from sequence_encoders import Scene
-from sivo.cli.main import main
-from sivo.sequences import open_sequence, read_trajectory
-from sivo.sequences.calibration import calibration_yaml
 
 FRAMES = 24
 FPS = 8.0  # a binary fraction: every format holds the times exactly
@@ -22,8 +22,8 @@ FPS = 8.0  # a binary fraction: every format holds the times exactly
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    from sivo.simulation.generate import simulate
-    from sivo.simulation.settings import SimulationSettings
+    from improvo.simulation.generate import simulate
+    from improvo.simulation.settings import SimulationSettings
 
     folder = tmp_path_factory.mktemp("simulated") / "s"
     settings = SimulationSettings(

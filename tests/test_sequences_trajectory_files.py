@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from improvo.errors import InputError
+from improvo.geometry.se3 import quat_xyzw_from_rotation, rotation_angle_deg
+from improvo.sequences import read_trajectory, write_trajectory
+from improvo.sequences.trajectory_files import clean_poses, read_trajectory_report
+from improvo.types import Trajectory
 from sequence_builders import poses
-from sivo.errors import InputError
-from sivo.geometry.se3 import quat_xyzw_from_rotation, rotation_angle_deg
-from sivo.sequences import read_trajectory, write_trajectory
-from sivo.sequences.trajectory_files import clean_poses, read_trajectory_report
-from sivo.types import Trajectory
 
 
 def trajectory(count: int = 6) -> Trajectory:

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from improvo.errors import InputError
+from improvo.sequences import open_sequence
+from improvo.sequences.calibration import calibration_yaml
 from sequence_builders import CAMERA, images, write_video
-from sivo.errors import InputError
-from sivo.sequences import open_sequence
-from sivo.sequences.calibration import calibration_yaml
 
 COUNT = 60
 

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
+from improvo.errors import InputError
+from improvo.geometry.camera import Camera
+from improvo.sequences import open_sequence
+from improvo.sequences.calibration import calibration_yaml
+from improvo.sequences.rectification import Rectifier
 from sequence_builders import CAMERA, images, write_images
-from sivo.errors import InputError
-from sivo.geometry.camera import Camera
-from sivo.sequences import open_sequence
-from sivo.sequences.calibration import calibration_yaml
-from sivo.sequences.rectification import Rectifier
 
 BROWN = Camera(160, 120, 90.0, 91.0, 77.0, 62.0, (-0.29, 0.08, 0.001, -0.002))
 CAMERAS = [

@@ -12,15 +12,15 @@ import cv2
 import numpy as np
 import pytest
 
-from sivo.cli.main import main
-from sivo.geometry.se3 import inverse, rigid, so3_exp, transform
-from sivo.sequences import open_sequence
-from sivo.simulation.causes import Cause
-from sivo.simulation.flow import pixel_grid
-from sivo.simulation.generate import simulated_frames
-from sivo.simulation.renderer import SceneRenderer, camera_of
-from sivo.simulation.scene import build_scene
-from sivo.simulation.settings import preset
+from improvo.cli.main import main
+from improvo.geometry.se3 import inverse, rigid, so3_exp, transform
+from improvo.sequences import open_sequence
+from improvo.simulation.causes import Cause
+from improvo.simulation.flow import pixel_grid
+from improvo.simulation.generate import simulated_frames
+from improvo.simulation.renderer import SceneRenderer, camera_of
+from improvo.simulation.scene import build_scene
+from improvo.simulation.settings import preset
 
 
 def _draws() -> bool:
@@ -145,7 +145,7 @@ def test_many_scenes_in_parallel(tmp_path: Path) -> None:
 def test_simulate_refuses_what_it_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     assert main(["simulate", "-o", str(tmp_path)]) == 2
-    assert "sivo did not write" in capsys.readouterr().err
+    assert "improvo did not write" in capsys.readouterr().err
     assert main(["simulate", "-o", str(tmp_path / "new"), "--size", "wide"]) == 2
     assert main(["simulate", "-o", str(tmp_path / "new"), "--set", "walker=2"]) == 2
     assert "walkers" in capsys.readouterr().err

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sivo.errors import ConfigError
-from sivo.geometry.camera import Camera
-from sivo.geometry.se3 import rigid, so3_exp
-from sivo.simulation import bundled_sequence
-from sivo.simulation.causes import _depth_discontinuities, _shadow_edges
-from sivo.simulation.flow import image_motion, pixel_grid
-from sivo.simulation.scene import build_scene
-from sivo.simulation.sensor import Sensor
-from sivo.simulation.settings import PRESETS, SimulationSettings, preset
+from improvo.errors import ConfigError
+from improvo.geometry.camera import Camera
+from improvo.geometry.se3 import rigid, so3_exp
+from improvo.simulation import bundled_sequence
+from improvo.simulation.causes import _depth_discontinuities, _shadow_edges
+from improvo.simulation.flow import image_motion, pixel_grid
+from improvo.simulation.scene import build_scene
+from improvo.simulation.sensor import Sensor
+from improvo.simulation.settings import PRESETS, SimulationSettings, preset
 
 PERFECT = {"noise": 0.0, "vignetting": 0.0, "exposure_drift": 0.0, "exposure_time": 0.0}
 
@@ -150,7 +150,7 @@ def test_only_edges_of_shadows_that_move_count() -> None:
 def test_the_bundled_sequence_is_small_long_and_lively() -> None:
     import cv2
 
-    from sivo.sequences import open_sequence
+    from improvo.sequences import open_sequence
 
     folder = bundled_sequence()
     assert sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) <= 3 * 2**20

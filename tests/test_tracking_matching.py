@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sivo.tracking.connect import TrackChain
-from sivo.tracking.matching import distance_threshold, mutual_nearest_neighbours, without_strays
-from sivo.types import Features
+from improvo.tracking.connect import TrackChain
+from improvo.tracking.matching import distance_threshold, mutual_nearest_neighbours, without_strays
+from improvo.types import Features
 
 
 def features(descriptors: np.ndarray) -> Features:

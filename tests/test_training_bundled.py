@@ -6,11 +6,11 @@ import json
 
 import pytest
 
-from sivo.frontend.network import load_network_frontend
-from sivo.frontend.weights import BUNDLED, bundled_names, load_weights
-from sivo.training.precision import ScoredDetector, classical_detectors, mean_average_precision, shape_tests
-from sivo.training.settings import PhotometricSettings
-from sivo.types import Float32, UInt8
+from improvo.frontend.network import load_network_frontend
+from improvo.frontend.weights import BUNDLED, bundled_names, load_weights
+from improvo.training.precision import ScoredDetector, classical_detectors, mean_average_precision, shape_tests
+from improvo.training.settings import PhotometricSettings
+from improvo.types import Float32, UInt8
 
 NAMES = [name for name in ("superpoint", "superpoint-small") if name in bundled_names()]
 FORBIDDEN = ("redkitchen", "hololens", "checkerboard", "kitti")

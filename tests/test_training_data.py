@@ -9,18 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
-from sivo.errors import InputError
-from sivo.training.labels import DUSTBIN, IGNORED, Consensus, PointLabels, label_cells, load_labels, save_labels
-from sivo.training.pictures import Pictures, Source, load_pictures
-from sivo.training.settings import (
+from improvo.errors import InputError
+from improvo.training.labels import DUSTBIN, IGNORED, Consensus, PointLabels, label_cells, load_labels, save_labels
+from improvo.training.pictures import Pictures, Source, load_pictures
+from improvo.training.settings import (
     AdaptationSettings,
     HomographiesSettings,
     OptimiserSettings,
     PhotometricSettings,
     ViewSettings,
 )
-from sivo.training.shapes import FAMILIES, draw_shape
-from sivo.training.views import inside, random_view, warp_points
+from improvo.training.shapes import FAMILIES, draw_shape
+from improvo.training.views import inside, random_view, warp_points
 
 NO_LIGHT_CHANGE = PhotometricSettings(0.0, (1.0, 1.0), (1.0, 1.0), 0, 0, 0, 0, 0, 0, 0, 0.0, 0.0, 0)
 
@@ -119,7 +119,7 @@ def test_labels_survive_their_file(tmp_path: Path) -> None:
 
 
 def test_points_of_a_pair_show_the_same_place() -> None:
-    from sivo.training.pairs import PairBatches
+    from improvo.training.pairs import PairBatches
 
     rng = np.random.default_rng(0)
     smooth = cv2.GaussianBlur(rng.uniform(0, 255, (240, 320)).astype(np.float32), (0, 0), 6)
@@ -174,7 +174,7 @@ def test_folders_without_a_picture_are_refused(tmp_path: Path) -> None:
 
 
 def test_augmentation_is_seeded_and_stays_in_range() -> None:
-    from sivo.training.photometric import augment
+    from improvo.training.photometric import augment
 
     image = np.tile(np.arange(160, dtype=np.uint8), (120, 1))
     for seed in range(20):

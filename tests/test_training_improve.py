@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from rendered_walk import write_walk
 
-from sivo.cli.main import main
-from sivo.frontend.network import load_network_frontend
-from sivo.frontend.weights import load_weights, save_weights
+from improvo.cli.main import main
+from improvo.frontend.network import load_network_frontend
+from improvo.frontend.weights import load_weights, save_weights
 
 COMMAND = [
     *("--frontend", "superpoint-small", "--max-keypoints", "250", "--steps", "6", "--batch-size", "2"),
@@ -35,7 +35,7 @@ def test_a_round_is_the_same_after_a_kill(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
 
     def start(out: Path) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "sivo", "improve", str(walk), "-o", str(out), *COMMAND]
+        command = [sys.executable, "-m", "improvo", "improve", str(walk), "-o", str(out), *COMMAND]
         return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     began = time.monotonic()
@@ -96,6 +96,6 @@ def test_a_checkpoint_that_finds_the_disk_full_is_one_line(tmp_path: Path, capsy
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     message = capsys.readouterr().err.strip().splitlines()[-1]
-    assert message.startswith("sivo: ")
+    assert message.startswith("improvo: ")
     assert "checkpoint.pt: cannot be written (is the disk full?" in message
     assert not list(tmp_path.glob("*.partial*"))

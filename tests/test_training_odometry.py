@@ -12,6 +12,24 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs the extra `train`")
 
+from improvo.cli.main import main  # noqa: E402
+from improvo.frontend.architecture import Architecture  # noqa: E402
+from improvo.frontend.superpoint import SuperPoint, sample_stability  # noqa: E402
+from improvo.frontend.weights import ModelCard, load_weights, save_weights  # noqa: E402
+from improvo.labeling.labelled import read_labels  # noqa: E402
+from improvo.labeling.stability import IGNORE, STABLE, UNSTABLE  # noqa: E402
+from improvo.training.labelled_frames import LabelledFrames, common_points  # noqa: E402
+from improvo.training.labels import IGNORED  # noqa: E402
+from improvo.training.losses import info_nce_loss, stability_loss  # noqa: E402
+from improvo.training.settings import (  # noqa: E402
+    LandmarkSettings,
+    OdometryTrainingSettings,
+    OptimiserSettings,
+    PairSettings,
+    ViewSettings,
+)
+from improvo.training.stages import loaded  # noqa: E402
+from improvo.training.tracked_pairs import TrackedPairs  # noqa: E402
 from labelled_scene import (  # noqa: E402
     CAMERA,
     FAR,
@@ -23,24 +41,6 @@ from labelled_scene import (  # noqa: E402
     scene_points,
     write_labelled_scene,
 )
-from sivo.cli.main import main  # noqa: E402
-from sivo.frontend.architecture import Architecture  # noqa: E402
-from sivo.frontend.superpoint import SuperPoint, sample_stability  # noqa: E402
-from sivo.frontend.weights import ModelCard, load_weights, save_weights  # noqa: E402
-from sivo.labeling.labelled import read_labels  # noqa: E402
-from sivo.labeling.stability import IGNORE, STABLE, UNSTABLE  # noqa: E402
-from sivo.training.labelled_frames import LabelledFrames, common_points  # noqa: E402
-from sivo.training.labels import IGNORED  # noqa: E402
-from sivo.training.losses import info_nce_loss, stability_loss  # noqa: E402
-from sivo.training.settings import (  # noqa: E402
-    LandmarkSettings,
-    OdometryTrainingSettings,
-    OptimiserSettings,
-    PairSettings,
-    ViewSettings,
-)
-from sivo.training.stages import loaded  # noqa: E402
-from sivo.training.tracked_pairs import TrackedPairs  # noqa: E402
 
 TINY = Architecture("tiny", encoder=(4, 4, 4, 4, 8, 8, 8, 8), head=8, descriptor=8, stability=False)
 PAPER = LandmarkSettings(
@@ -156,7 +156,7 @@ def settings_of(**changes: Any) -> OdometryTrainingSettings:
 
 def test_pairs_show_the_same_points_and_repeat_for_the_same_seed(store: Path) -> None:
     # without augmentation of light the taught places can be looked at: the same dot has the same brightness
-    from sivo.training.settings import PhotometricSettings
+    from improvo.training.settings import PhotometricSettings
 
     plain = PhotometricSettings(
         brightness=0, contrast=(1, 1), gamma=(1, 1), shade_share=0, vignette_share=0, blur_share=0, motion_share=0,
@@ -239,7 +239,7 @@ def test_the_command_teaches_stability_and_says_so_on_the_card(
     store: Path, tiny_weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = tmp_path / "settings.yaml"
-    from sivo.config import to_yaml
+    from improvo.config import to_yaml
 
     config.write_text(to_yaml(settings_of()))
     command = ["train", "odometry", str(store), "-o", str(tmp_path / "out"), "--from", str(tiny_weights)]
@@ -280,10 +280,10 @@ def test_pictures_are_rehearsed_beside_the_labels(store: Path, tiny_weights: Pat
     card = load_weights(tmp_path / "out" / "weights.safetensors").card
     assert [source.name for source in card.data] == ["walls", "pictures"]
 
-    from sivo.training.labels import load_labels
-    from sivo.training.pairs import PairBatches
-    from sivo.training.pictures import load_pictures
-    from sivo.training.settings import HomographiesSettings
+    from improvo.training.labels import load_labels
+    from improvo.training.pairs import PairBatches
+    from improvo.training.pictures import load_pictures
+    from improvo.training.settings import HomographiesSettings
 
     settings = settings_of()
     loaded_pictures = load_pictures([str(pictures)], 160)
@@ -314,7 +314,7 @@ def test_frames_that_are_useful_have_stable_points(store: Path) -> None:
 
 
 def test_the_stability_head_can_be_trained_alone(store: Path, tiny_weights: Path, tmp_path: Path) -> None:
-    from sivo.config import to_yaml
+    from improvo.config import to_yaml
 
     config = tmp_path / "settings.yaml"
     config.write_text(to_yaml(settings_of(stability_alone=True)))

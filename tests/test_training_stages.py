@@ -13,18 +13,18 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs the extra `train`")
 
-from sivo.cli.main import main  # noqa: E402
-from sivo.frontend.architecture import ARCHITECTURES, Architecture  # noqa: E402
-from sivo.frontend.superpoint import SuperPoint  # noqa: E402
-from sivo.frontend.weights import load_weights  # noqa: E402
-from sivo.training.homographies import JointStage  # noqa: E402
-from sivo.training.losses import detector_loss, hinge_loss, info_nce_loss  # noqa: E402
-from sivo.training.magic_point import MagicPointStage  # noqa: E402
-from sivo.training.pairs import PairBatches  # noqa: E402
-from sivo.training.settings import HomographiesSettings, OptimiserSettings, ShapesSettings, ViewSettings  # noqa: E402
-from sivo.training.synthetic import ShapeBatches, shape_source  # noqa: E402
-from sivo.training.trainer import DivergedError, Trainer  # noqa: E402
-from sivo.training.widen import widen  # noqa: E402
+from improvo.cli.main import main  # noqa: E402
+from improvo.frontend.architecture import ARCHITECTURES, Architecture  # noqa: E402
+from improvo.frontend.superpoint import SuperPoint  # noqa: E402
+from improvo.frontend.weights import load_weights  # noqa: E402
+from improvo.training.homographies import JointStage  # noqa: E402
+from improvo.training.losses import detector_loss, hinge_loss, info_nce_loss  # noqa: E402
+from improvo.training.magic_point import MagicPointStage  # noqa: E402
+from improvo.training.pairs import PairBatches  # noqa: E402
+from improvo.training.settings import HomographiesSettings, OptimiserSettings, ShapesSettings, ViewSettings  # noqa: E402
+from improvo.training.synthetic import ShapeBatches, shape_source  # noqa: E402
+from improvo.training.trainer import DivergedError, Trainer  # noqa: E402
+from improvo.training.widen import widen  # noqa: E402
 
 TINY = Architecture("tiny", encoder=(4, 4, 4, 4, 8, 8, 8, 8), head=8, descriptor=8, stability=False)
 VIEWS = ViewSettings(height=48, width=64)
@@ -36,7 +36,7 @@ def optimiser(**changes: Any) -> OptimiserSettings:
 
 
 def joint(folder: Path, **changes: Any) -> Trainer:
-    from sivo.training.pictures import Pictures
+    from improvo.training.pictures import Pictures
 
     folder.mkdir(exist_ok=True)
     source, labels = shape_source(9, 1, 1.0)
@@ -201,8 +201,8 @@ def test_a_widened_network_computes_the_same() -> None:
 
 
 def test_views_made_in_a_batch_are_those_made_one_by_one() -> None:
-    from sivo.training.adaptation import warp_batch
-    from sivo.training.views import random_view, warp_image
+    from improvo.training.adaptation import warp_batch
+    from improvo.training.views import random_view, warp_image
 
     rng = np.random.default_rng(0)
     picture = cv2.GaussianBlur(rng.uniform(0, 255, (96, 128)).astype(np.float32), (0, 0), 3)
@@ -214,9 +214,9 @@ def test_views_made_in_a_batch_are_those_made_one_by_one() -> None:
 
 
 def test_adaptation_finds_the_corners_of_a_board() -> None:
-    from sivo.training.adaptation import adapt, shi_tomasi
-    from sivo.training.pictures import Pictures, Source
-    from sivo.training.settings import AdaptationSettings
+    from improvo.training.adaptation import adapt, shi_tomasi
+    from improvo.training.pictures import Pictures, Source
+    from improvo.training.settings import AdaptationSettings
 
     y, x = np.mgrid[0:240, 0:320]
     board = np.where((x // 40 + y // 40) % 2, 40, 210).astype(np.uint8)

@@ -20,7 +20,7 @@
 
 namespace {
 
-constexpr double kMinDepth = 1e-6;  // as MIN_DEPTH in sivo/backend/objective.py
+constexpr double kMinDepth = 1e-6;  // as MIN_DEPTH in improvo/backend/objective.py
 
 using Vector3 = Eigen::Vector3d;
 using Matrix3 = Eigen::Matrix3d;

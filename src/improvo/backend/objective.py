@@ -1,0 +1,79 @@
+"""The objective of the paper, written to be read: the reference that the compiled solver is tested against.
+
+    Omega = sum_ij w_ij rho(e_ij^2 + d(Z_ij))                                     (paper, eq. ba-obj)
+
+e_ij^2 + d(Z_ij) is the squared norm of one residual vector per observation, in this order:
+
+    u - u_ij, v - v_ij                pixels, eq. reprojection
+    max(0, Z - depth_max)             eq. depth_regularization, times sqrt(depth_weight)
+    min(0, Z - depth_min)
+
+so that rho, the Huber loss of that squared norm, is what Ceres calls HuberLoss, and w_ij its ScaledLoss (Ceres reports
+half of the sum). A point behind the camera keeps its mirrored projection, as the equations have it: only the depth
+term speaks against it, so callers drop what ends up there. Within MIN_DEPTH of the plane of the camera, where the
+projection has no value, it is that of the nearest plane on the same side.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from improvo.backend.problem import BundleProblem
+from improvo.backend.settings import ObjectiveSettings
+from improvo.types import Float64
+
+MIN_DEPTH = 1e-6  # map units
+
+
+def points_in_cameras(problem: BundleProblem, cam_from_world: Float64, points: Float64) -> Float64:
+    """R_i X_j + t_i of every observation (O, 3)."""
+    pose = cam_from_world[problem.camera_index]
+    return np.einsum("oij,oj->oi", pose[:, :3, :3], points[problem.point_index]) + pose[:, :3, 3]
+
+
+def away_from_zero(depth: Float64) -> Float64:
+    """The depth, moved to at least MIN_DEPTH from zero on its own side (zero counts as in front)."""
+    side = np.where(depth < 0, -1.0, 1.0)
+    return np.where(np.abs(depth) < MIN_DEPTH, side * MIN_DEPTH, depth)
+
+
+def residuals(
+    problem: BundleProblem, objective: ObjectiveSettings, cam_from_world: Float64, points: Float64
+) -> Float64:
+    """(O, 4) residual vectors; the squared norm of a row is e_ij^2 + d(Z_ij)."""
+    K = problem.K
+    x, y, z = points_in_cameras(problem, cam_from_world, points).T
+    z_safe = away_from_zero(z)
+    scale = np.sqrt(objective.depth_weight)
+    return np.stack(
+        [
+            K[0, 0] * x / z_safe + K[0, 2] - problem.keypoints[:, 0],
+            K[1, 1] * y / z_safe + K[1, 2] - problem.keypoints[:, 1],
+            scale * np.maximum(z - objective.depth_max, 0.0),
+            scale * np.minimum(z - objective.depth_min, 0.0),
+        ],
+        axis=1,
+    )
+
+
+def huber(squared_norm: Float64, width: float) -> Float64:
+    """rho(s): s up to width^2, then 2 width sqrt(s) - width^2, which continues it with equal slope."""
+    s = np.asarray(squared_norm, np.float64)
+    return np.where(s <= width**2, s, 2 * width * np.sqrt(np.maximum(s, 0.0)) - width**2)
+
+
+def huber_slope(squared_norm: Float64, width: float) -> Float64:
+    """rho'(s), by which least squares re-weights the observation."""
+    s = np.asarray(squared_norm, np.float64)
+    return np.where(s <= width**2, 1.0, width / np.sqrt(np.maximum(s, width**2)))
+
+
+def cost(problem: BundleProblem, objective: ObjectiveSettings, cam_from_world: Float64, points: Float64) -> float:
+    """Omega."""
+    squared_norm = (residuals(problem, objective, cam_from_world, points) ** 2).sum(axis=1)
+    return float(problem.weights @ huber(squared_norm, objective.huber_width))
+
+
+def reprojection_errors(problem: BundleProblem, cam_from_world: Float64, points: Float64) -> Float64:
+    """e_ij of every observation (O,), pixels."""
+    return np.hypot(*residuals(problem, ObjectiveSettings(depth_weight=0.0), cam_from_world, points)[:, :2].T)

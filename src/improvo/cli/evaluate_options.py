@@ -1,0 +1,98 @@
+"""Options that the protocols of `improvo evaluate` share, and what they mean."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from improvo.errors import MissingExtraError
+
+if TYPE_CHECKING:
+    from improvo.evaluation.sources import FeatureSource, LoadedFrontend
+
+DEFAULT_FRONTENDS = ["sift", "orb", "akaze"]
+
+
+def add_frontend_arguments(parser: argparse.ArgumentParser, max_keypoints: int) -> None:
+    """Which frontends, and how many keypoints (the default is given for the help only)."""
+    parser.add_argument(
+        "--frontend",
+        action="append",
+        metavar="NAME",
+        help="sift, orb, akaze, surf, superpoint-vo, ..., a .safetensors file, a peer (xfeat, aliked, disk), or `all` "
+        f"that can run; LABEL=NAME names its row; repeatable (default: {', '.join(DEFAULT_FRONTENDS)})",
+    )
+    parser.add_argument(
+        "--max-keypoints",
+        type=int,
+        default=argparse.SUPPRESS,
+        metavar="N",
+        help=f"kept per image, best first (default: {max_keypoints})",
+    )
+
+
+def add_run_arguments(parser: argparse.ArgumentParser) -> None:
+    """Seed, processes, output folder."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    parser.add_argument("--seed", type=int, default=argparse.SUPPRESS, help="of all random choices (default: 0)")
+    parser.add_argument("--workers", type=int, default=cores, metavar="N", help="processes")
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="folder for the results")
+
+
+def loaded_frontends(
+    asked: list[str] | None, max_keypoints: int, default: list[str] | None = None
+) -> tuple[list[LoadedFrontend], list[dict[str, str]]]:
+    """The frontends of the command line, each loaded once so that a wrong name fails before any work.
+
+    Returns:
+        The frontends, and those of `all` that cannot run here, with the reason.
+
+    Raises:
+        ConfigError, InputError: an unknown name. MissingExtraError: one that was named cannot run here.
+    """
+    from improvo.evaluation.sources import PEERS, LoadedFrontend
+    from improvo.frontend.registry import CLASSICAL
+    from improvo.frontend.weights import bundled_names
+
+    asked = asked or (DEFAULT_FRONTENDS if default is None else default)
+    named = [name for name in asked if name != "all"]
+    optional = [name for name in (*CLASSICAL, *bundled_names(), *PEERS) if name not in named] if "all" in asked else []
+    found: list[LoadedFrontend] = []
+    skipped: list[dict[str, str]] = []
+    for text in (*named, *optional):
+        label, name = split_label(text)
+        source = LoadedFrontend(name, max_keypoints, label)
+        try:
+            source.check()
+        except MissingExtraError as error:
+            if text in named:
+                raise
+            skipped.append({"frontend": name, "reason": str(error)})
+        else:
+            found.append(source)
+    return found, skipped
+
+
+def exported_features(asked: list[str], max_keypoints: int, one_sequence: bool) -> list[FeatureSource]:
+    """The `--features` of the command line, each looked into once.
+
+    Raises:
+        InputError: nothing exported there.
+    """
+    from improvo.evaluation.exported import ExportedFeatures
+
+    found: list[FeatureSource] = []
+    for text in asked:
+        label, path = split_label(text)
+        exported = ExportedFeatures(path, label or Path(path).stem, max_keypoints, one_sequence)
+        exported.check()
+        found.append(exported)
+    return found
+
+
+def split_label(text: str) -> tuple[str, str]:
+    """`LABEL=REST` in two; the label is empty where there is none."""
+    label, separator, rest = text.partition("=")
+    return (label, rest) if separator and label else ("", text)

@@ -1,0 +1,205 @@
+"""3D-to-2D pose estimation on random frame pairs (the paper's Table 1): match, lift image A by its depth, solve for B.
+
+Sequences need depth and true poses. Every frontend gets the same pairs. With -o the features are kept, so that adding
+a frontend or a gap computes only what is new.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.errors import ImprovoError, InputError
+from improvo.evaluation.settings import ESTIMATORS, SAMPLINGS, PoseCommandSettings, PoseSettings
+
+if TYPE_CHECKING:
+    from improvo.evaluation.sources import FeatureSource, Recorded
+
+COMMAND = "evaluate pose"
+
+
+_FLAGS = {
+    "gaps": "pose.gaps",
+    "pairs": "pose.pairs",
+    "estimator": "pose.estimators",
+    "depth_sampling": "pose.depth_sampling",
+    "max_keypoints": "pose.max_keypoints",
+    "seed": "pose.seed",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `improvo evaluate pose`."""
+    defaults, absent = PoseSettings(), argparse.SUPPRESS
+    parser.add_argument("sequences", nargs="*", type=Path, metavar="SEQUENCE", help="with depth and true poses")
+    add_frontend_arguments(parser, defaults.max_keypoints)
+    parser.add_argument(
+        "--features",
+        action="append",
+        default=[],
+        metavar="[LABEL=]PATH",
+        help="features exported by another program: a folder of NPZ files, or an HDF5 file of hloc; repeatable",
+    )
+    gaps = " ".join(map(str, defaults.gaps))
+    parser.add_argument(
+        "--gaps", nargs="+", type=int, default=absent, help=f"frames between the two images (default: {gaps})"
+    )
+    parser.add_argument(
+        "--pairs", type=int, default=absent, metavar="N", help=f"per sequence and gap (default: {defaults.pairs})"
+    )
+    parser.add_argument(
+        "--estimator",
+        nargs="+",
+        choices=ESTIMATORS,
+        default=absent,
+        help="opencv: default solvePnPRansac, the paper's; poselib: a robust one (default: both)",
+    )
+    parser.add_argument(
+        "--depth-sampling", choices=SAMPLINGS, default=absent, help=f"(default: {defaults.depth_sampling})"
+    )
+    parser.add_argument("--per-sequence", action="store_true", help="print the table of each sequence too")
+    parser.add_argument("--from", dest="results", type=Path, metavar="POSE.JSON", help="print an earlier run again")
+    parser.add_argument("--export-images", type=Path, metavar="DIR", help="write the frames of all pairs, and stop")
+    add_run_arguments(parser)
+    add_sequence_arguments(parser)
+    add_config_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int | None:
+    """Evaluate, or print again; leaves pose.json, pose.md, curves and pairs.parquet in the output folder."""
+    from improvo.evaluation.tables import pose_tables
+
+    if arguments.results is not None:
+        results = read_results(arguments.results)
+        print(pose_tables(results, arguments.per_sequence), end="")
+        _draw(results, arguments.results.parent if arguments.output is None else arguments.output)
+        return 0
+    if not arguments.sequences:
+        raise InputError("improvo evaluate pose: give a SEQUENCE, or --from POSE.JSON")
+    if arguments.export_images is not None:
+        return _export(arguments)
+    results = _evaluate(arguments)
+    print(pose_tables(results, arguments.per_sequence), end="")
+    return 0
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """The content of a `pose.json`.
+
+    Raises:
+        InputError: not such a file.
+    """
+    try:
+        results: dict[str, Any] = json.loads(path.read_text())
+        if results["protocol"] != "pose" or not results["rows"]:
+            raise KeyError
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{path}: is no pose.json of `improvo evaluate pose`; check the path") from None
+    return results
+
+
+def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
+    from improvo import __version__
+    from improvo.cli.evaluate_options import exported_features, loaded_frontends
+    from improvo.evaluation.parallel import Workers
+    from improvo.evaluation.pose_results import results, write_records
+    from improvo.evaluation.pose_run import run_pose_protocol
+    from improvo.files import make_output_folder, write_json
+
+    settings, sources = _settings(arguments)
+    output: Path | None = arguments.output
+    if output is not None:
+        make_output_folder(output, COMMAND)
+    default: list[str] | None = [] if arguments.features else None
+    loaded, skipped = loaded_frontends(arguments.frontend, settings.max_keypoints, default)
+    exported = exported_features(arguments.features, settings.max_keypoints, one_sequence=len(sources) == 1)
+    frontends = [*loaded, *exported]
+    request = _request(settings, sources, frontends)
+    if output is not None and (output / "pose.json").is_file():
+        earlier = read_results(output / "pose.json")
+        if earlier.get("request") == json.loads(json.dumps(request)):
+            return earlier
+    with (
+        tempfile.TemporaryDirectory(prefix="improvo-") as temporary,
+        Workers(arguments.workers, progress=True) as workers,
+    ):
+        cache = (output or Path(temporary)) / "features"
+        run = run_pose_protocol(list(sources), frontends, settings, cache, workers)
+    found = {
+        "protocol": "pose",
+        "improvo": __version__,
+        **results(run),
+        "skipped_frontends": skipped,
+        "request": request,
+    }
+    if output is not None:
+        write_records(run, output / "pairs.parquet")
+        write_json(output / "pose.json", found)
+        _write_text(found, output)
+        _draw(found, output)
+    return found
+
+
+def _settings(arguments: argparse.Namespace) -> tuple[PoseSettings, list[Recorded]]:
+    from improvo.evaluation.sources import Recorded
+
+    settings = settings_from(PoseCommandSettings, arguments, _FLAGS)
+    return settings.pose, [Recorded(str(path), settings.sequence) for path in arguments.sequences]
+
+
+def _request(settings: PoseSettings, sources: list[Recorded], frontends: list[FeatureSource]) -> dict[str, Any]:
+    """All that decides the result; an earlier result with the same request is printed again."""
+    from improvo.config import to_dict
+    from improvo.evaluation.sources import sequence_fingerprint
+
+    return {
+        "settings": to_dict(settings),
+        "sequences": [sequence_fingerprint(source, source.open()) for source in sources],
+        "frontends": [{"label": frontend.label, **frontend.fingerprint()} for frontend in frontends],
+    }
+
+
+def _write_text(results: dict[str, Any], output: Path) -> None:
+    from improvo.evaluation.tables import pose_tables
+    from improvo.files import write_text
+
+    write_text(output / "pose.md", pose_tables(results, sequences=len(results["sequences"]) > 1))
+
+
+def _draw(results: dict[str, Any], output: Path) -> None:
+    from improvo.evaluation.plots import draw_pose_curves
+
+    for estimator in results["settings"]["estimators"]:
+        draw_pose_curves(results, estimator, output / f"curves-{estimator}.png")
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    """Write the frames that the evaluation will use, as delivered, for a frontend that runs elsewhere."""
+    import cv2
+
+    from improvo.evaluation.pairs import pairs_of_sequence
+    from improvo.files import make_output_folder, written_atomically
+
+    make_output_folder(arguments.export_images, f"{COMMAND} --export-images")
+    settings, sources = _settings(arguments)
+    written = 0
+    for source in sources:
+        sequence = source.open()
+        drawn = pairs_of_sequence(sequence, settings.gaps, settings.pairs, settings.seed)
+        folder = arguments.export_images / sequence.name
+        folder.mkdir(exist_ok=True)
+        for row in sorted({int(i) for pairs in drawn.pairs.values() for i in pairs.ravel()}):
+            try:
+                frame = sequence[row]
+            except ImprovoError:
+                continue  # its pairs are left out of the evaluation, too
+            with written_atomically(folder / f"{frame.index:06d}.png") as temporary:
+                cv2.imwrite(str(temporary), frame.image)
+            written += 1
+    print(f"{written} images in {arguments.export_images}; export features as SEQUENCE/NUMBER.npz beside or elsewhere")
+    return 0

@@ -1,0 +1,129 @@
+"""A trajectory against the truth (Zhang and Scaramuzza 2018): absolute error, relative errors over sub-trajectories.
+
+ESTIMATE is a TUM, KITTI or EuRoC file, or the output folder of `improvo run`; TRUTH such a file, or a sequence that has
+true poses. Segments of an estimate (`# segment N` lines) are aligned each on its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.errors import InputError
+from improvo.evaluation.settings import ALIGNMENTS, TrajectoryCommandSettings, TrajectorySettings
+from improvo.sequences.base import SequenceSettings
+
+if TYPE_CHECKING:
+    from improvo.types import Trajectory
+
+COMMAND = "evaluate trajectory"
+KITTI_LENGTHS = [100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0]
+TRAJECTORY_FLAGS = {
+    "alignment": "trajectory.alignment",
+    "windows": "trajectory.time_windows",
+    "distances": "trajectory.distance_windows",
+    "max_time_difference": "trajectory.max_time_difference",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `improvo evaluate trajectory`."""
+    parser.add_argument("estimate", type=Path, metavar="ESTIMATE")
+    parser.add_argument("truth", type=Path, metavar="TRUTH")
+    add_trajectory_arguments(parser)
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="folder for trajectory.json and trajectory.md")
+    add_sequence_arguments(parser)
+    add_config_arguments(parser)
+
+
+def add_trajectory_arguments(parser: argparse.ArgumentParser) -> None:
+    """Alignment and windows, shared with `improvo evaluate vo`."""
+    defaults, absent = TrajectorySettings(), argparse.SUPPRESS
+    parser.add_argument(
+        "--alignment", choices=ALIGNMENTS, default=absent, help=f"of the estimate (default: {defaults.alignment})"
+    )
+    windows = " ".join(f"{window:g}" for window in defaults.time_windows)
+    parser.add_argument(
+        "--windows", nargs="+", type=float, default=absent, help=f"sub-trajectories, seconds (default: {windows})"
+    )
+    distances = parser.add_mutually_exclusive_group()
+    distances.add_argument("--distances", nargs="+", type=float, default=absent, help="sub-trajectories, metres")
+    distances.add_argument(
+        "--kitti",
+        dest="distances",
+        action="store_const",
+        const=KITTI_LENGTHS,
+        default=absent,
+        help="sub-trajectories of 100, 200, ... 800 m",
+    )
+    parser.add_argument(
+        "--max-time-difference",
+        type=float,
+        default=absent,
+        metavar="SECONDS",
+        help=f"between estimate and truth (default: {defaults.max_time_difference})",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int | None:
+    """Print the tables; with -o leave trajectory.json and trajectory.md."""
+    from improvo.config import to_dict
+    from improvo.evaluation.trajectory import evaluate_trajectory
+    from improvo.evaluation.trajectory_tables import trajectory_tables
+    from improvo.files import make_output_folder, write_json, write_text
+
+    command = settings_from(TrajectoryCommandSettings, arguments, TRAJECTORY_FLAGS)
+    settings = command.trajectory
+    if arguments.output is not None:
+        make_output_folder(arguments.output, COMMAND)
+    estimate, truth, notes = read_pair(arguments.estimate, arguments.truth, command.sequence)
+    errors = evaluate_trajectory(estimate, truth, settings, (str(arguments.estimate), str(arguments.truth)))
+    result = {
+        "protocol": "trajectory",
+        "estimate": str(arguments.estimate),
+        "truth": str(arguments.truth),
+        "settings": to_dict(settings),
+        **to_dict(errors),
+        "notes": list(notes),
+    }
+    text = trajectory_tables(result, arguments.estimate.name)
+    print(text + "".join(f"\n{note}" for note in notes), end="\n" if notes else "")
+    if arguments.output is not None:
+        write_json(arguments.output / "trajectory.json", result)
+        write_text(arguments.output / "trajectory.md", text)
+    return 0
+
+
+def read_pair(
+    estimate_path: Path, truth_path: Path, sequence: SequenceSettings | None = None
+) -> tuple[Trajectory, Trajectory, tuple[str, ...]]:
+    """Both trajectories, and what was odd in their files. Two KITTI files of one length count the same frames.
+
+    Raises:
+        InputError: a file that is no trajectory, a folder without one, a sequence without true poses.
+    """
+    from improvo.sequences import open_sequence
+    from improvo.sequences.trajectory_files import read_trajectory_report
+    from improvo.types import Trajectory
+
+    if truth_path.is_dir():
+        truth, truth_notes = open_sequence(truth_path, sequence).ground_truth, tuple[str, ...]()
+        if truth is None:
+            raise InputError(f"{truth_path}: has no true poses; give a trajectory file or a sequence that has them")
+    else:
+        truth, truth_notes = read_trajectory_report(truth_path)
+    if estimate_path.is_dir():
+        estimate_path = estimate_path / "trajectory.txt"
+    estimate, estimate_notes = read_trajectory_report(estimate_path)
+    if _columns(estimate_path) == _columns(truth_path) == 12 and len(estimate) == len(truth):
+        estimate = Trajectory(truth.times, estimate.world_from_cam, estimate.segment)
+    return estimate, truth, (*estimate_notes, *truth_notes)
+
+
+def _columns(path: Path) -> int:
+    if not path.is_file():
+        return 0
+    lines = (line for line in path.read_text().splitlines() if line.strip() and not line.startswith("#"))
+    return len(next(lines, "").split())

@@ -1,0 +1,79 @@
+"""Visual odometry with and without stability weights on sequences with true poses (the paper's Table 2).
+
+A frontend without a stability head gets one row. Sequences whose truth has invalid poses are left out and named.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments
+from improvo.cli.evaluate_trajectory import TRAJECTORY_FLAGS, add_trajectory_arguments
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.evaluation.settings import VoCommandSettings
+
+COMMAND = "evaluate vo"
+_FLAGS = {
+    **TRAJECTORY_FLAGS,
+    "max_keypoints": "max_keypoints",
+    "initialisation": "odometry.initialisation",
+    "seed": "odometry.seed",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `improvo evaluate vo`; `--stride` is 10 unless given."""
+    defaults = VoCommandSettings()
+    parser.add_argument("sequences", nargs="+", type=Path, metavar="SEQUENCE", help="with true poses")
+    add_frontend_arguments(parser, defaults.max_keypoints)
+    parser.add_argument(
+        "--initialisation",
+        choices=("robust", "paper"),
+        default=argparse.SUPPRESS,
+        help=f"of the odometry (default: {defaults.odometry.initialisation})",
+    )
+    add_trajectory_arguments(parser)
+    add_run_arguments(parser)
+    add_sequence_arguments(parser)
+    add_config_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int | None:
+    """Print Table 2; with -o leave vo.json, vo.md and the trajectories."""
+    from improvo import __version__
+    from improvo.cli.evaluate_options import loaded_frontends
+    from improvo.config import to_dict
+    from improvo.evaluation.parallel import Workers
+    from improvo.evaluation.sources import Recorded
+    from improvo.evaluation.trajectory_tables import vo_tables
+    from improvo.evaluation.vo import evaluate_vo
+    from improvo.files import make_output_folder, write_json, write_text
+    from improvo.sequences import write_trajectory
+
+    settings = settings_from(VoCommandSettings, arguments, _FLAGS)
+    output: Path | None = arguments.output
+    if output is not None:
+        make_output_folder(output, COMMAND)
+    frontends, _ = loaded_frontends(arguments.frontend, settings.max_keypoints, ["superpoint-vo"])
+    sources = [Recorded(str(path), settings.sequence) for path in arguments.sequences]
+    with Workers(arguments.workers, progress=True) as workers:
+        outcomes, found = evaluate_vo(
+            sources,
+            [frontend.name for frontend in frontends],
+            settings.max_keypoints,
+            settings.odometry,
+            settings.trajectory,
+            workers,
+        )
+    results = {"protocol": "vo", "improvo": __version__, "settings": to_dict(settings), **found}
+    text = vo_tables(results)
+    print(text, end="")
+    if output is not None:
+        for outcome in outcomes:
+            folder = output / f"{outcome.frontend}{outcome.variant}"
+            folder.mkdir(exist_ok=True)
+            write_trajectory(folder / f"{outcome.sequence}.txt", outcome.trajectory)
+        write_json(output / "vo.json", results)
+        write_text(output / "vo.md", text)
+    return 0

@@ -1,0 +1,85 @@
+"""`improvo info SEQUENCE`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.sequences.settings import InfoSettings
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `improvo info`."""
+    parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a video, an image folder, a data set or a bag")
+    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
+    parser.add_argument(
+        "--samples",
+        type=int,
+        default=argparse.SUPPRESS,
+        metavar="N",
+        help=f"pairs of frames to look at (default: {InfoSettings().samples})",
+    )
+    add_sequence_arguments(parser)
+    add_config_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Look at the recording and print what was found."""
+    from tqdm import tqdm
+
+    from improvo.sequences.survey import survey
+
+    settings = settings_from(InfoSettings, arguments, {"samples": "samples"})
+    with tqdm(unit="pair", desc="info", delay=1.0, leave=False) as bar:
+        findings = survey(arguments.sequence, settings.sequence, max(1, settings.samples), bar.update).to_dict()
+    if arguments.json:
+        print(json.dumps(findings, indent=2))
+        return
+    for name, text in _lines(findings):
+        print(f"{name:<14} {text}")
+    for problem in findings["problems"]:
+        print(f"! {problem['what']}\n  -> {problem['advice']}")
+    if not findings["problems"]:
+        print("nothing wrong was found")
+
+
+def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
+    width, height = facts["size"]
+    rate = "unknown rate" if facts["frames_per_second"] is None else f"{facts['frames_per_second']:.4g} per second"
+    camera, depth, truth = facts["camera"], facts["depth"], facts["ground_truth"]
+    lines = [
+        ("recognised as", f"{facts['format']} ({facts['path']})"),
+        ("frames", f"{facts['frames']}, {rate}, {facts['seconds']:.2f} s, {width}x{height}"),
+        ("camera", "none" if camera is None else _camera(camera)),
+    ]
+    if camera is not None:
+        lines.append(("view", f"{camera['view']}; {camera['horizontal_fov_deg']:.1f} degrees wide"))
+    if depth is None:
+        lines.append(("depth", "none"))
+    else:
+        median = "" if depth["median"] is None else f", median {depth['median']:.2f} m"
+        lines.append(("depth", f"{100 * depth['share_of_frames']:.0f} % of the frames{median}"))
+    if truth is None:
+        lines.append(("ground truth", "none"))
+    else:
+        lines.append(("ground truth", f"{truth['poses']} of {facts['frames']} frames, path {truth['path_length']:.2f}"))
+    lines += [
+        (
+            "pictures",
+            f"{100 * facts['duplicates']:.0f} % repeated, {100 * facts['blurred']:.0f} % blurred, "
+            f"median grey {facts['brightness']:.0f}, {100 * facts['clipped']:.0f} % clipped, "
+            f"{facts['corners']} corners, {facts['sampled']} sampled",
+        ),
+        ("gaps", str(len(facts["gaps"])) if facts["gaps"] else "none"),
+    ]
+    return lines + [("note", note) for note in facts["notes"]]
+
+
+def _camera(camera: dict[str, Any]) -> str:
+    text = f"fx {camera['fx']:.6g}, fy {camera['fy']:.6g}, cx {camera['cx']:.6g}, cy {camera['cy']:.6g}"
+    if camera["distortion"]:
+        text += f", {camera['distortion_model']} {[round(value, 5) for value in camera['distortion']]}"
+    return text

@@ -1,0 +1,159 @@
+"""Settings: frozen dataclasses, read from YAML and from `section.name=value` overrides; unknown keys raise."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from improvo.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def to_dict(settings: Any) -> dict[str, Any]:
+    """The settings as plain nested dictionaries, tuples as lists, ready for YAML or JSON."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(item) for key, item in value.items()}
+        return [plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+    result: dict[str, Any] = plain(dataclasses.asdict(settings))
+    return result
+
+
+def to_yaml(settings: Any) -> str:
+    """The settings as YAML that `load` reads back."""
+    import yaml
+
+    return yaml.safe_dump(to_dict(settings), sort_keys=False)
+
+
+def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = ()) -> T:
+    """Settings of type `cls` from defaults, a YAML file and `a.b=value` overrides, in that order.
+
+    Raises:
+        ConfigError: a file that is no YAML mapping, an unknown key, or a value of the wrong type.
+    """
+    import yaml
+
+    merged: dict[str, Any] = {}
+    if path is not None:
+        try:
+            loaded = yaml.safe_load(path.read_text()) or {}
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            reason = str(error).splitlines()[0]
+            raise ConfigError(
+                f"{path}: cannot be read as YAML ({reason}); `improvo config` prints a valid file"
+            ) from None
+        if not isinstance(loaded, dict):
+            raise ConfigError(f"{path}: must hold `key: value` pairs; `improvo config` prints a valid file")
+        merged = loaded
+    for override in overrides:
+        name, separator, text = override.partition("=")
+        if not separator:
+            raise ConfigError(f"--set {override}: write it as section.name=value")
+        target = merged
+        *sections, leaf = name.strip().split(".")
+        for section in sections:
+            target = target.setdefault(section, {})
+            if not isinstance(target, dict):
+                raise ConfigError(f"--set {override}: {section} is a value, not a section")
+        try:
+            target[leaf] = yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise ConfigError(f"--set {override}: the value is not readable") from None
+    return from_dict(cls, merged, where=str(path) if path else "settings")
+
+
+def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings") -> T:
+    """Build the dataclass `cls` from nested dictionaries.
+
+    Raises:
+        ConfigError: an unknown key (with the nearest known one) or a value of the wrong type.
+    """
+    import cattrs
+    from cattrs.errors import ClassValidationError
+
+    _refuse_unknown_keys(cls, values, where, prefix="")
+    if all(_has_default(field) for field in dataclasses.fields(cls)):  # type: ignore[arg-type]
+        # a section given in part keeps what this class has for the rest of it, not the section's own defaults
+        values = _over(to_dict(cls()), values)
+    converter = cattrs.Converter(forbid_extra_keys=True)
+    converter.register_structure_hook(bool, _strict(bool))
+    converter.register_structure_hook(int, _strict(int))
+    converter.register_structure_hook(float, _strict(float))
+    converter.register_structure_hook(str, _strict(str))
+    try:
+        return converter.structure(values, cls)
+    except ClassValidationError as error:
+        raise ConfigError(f"{where}: {_first_reason(error)}") from None
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{where}: {error}") from None
+
+
+def first_difference(before: Any, now: Any, prefix: str = "") -> str:
+    """The first setting that differs between two nested dictionaries, in words; empty where none does."""
+    if not (isinstance(before, dict) and isinstance(now, dict)):
+        return "" if before == now else f"{prefix.rstrip('.')}={before}, now {now}"
+    for key in [*before, *(key for key in now if key not in before)]:
+        difference = first_difference(before.get(key), now.get(key), f"{prefix}{key}.")
+        if difference:
+            return difference
+    return ""
+
+
+def _has_default(field: dataclasses.Field[Any]) -> bool:
+    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
+
+
+def _over(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """Nested dictionaries: the values, and the defaults where there is none."""
+    result = dict(defaults)
+    for key, value in values.items():
+        below = result.get(key)
+        result[key] = _over(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+    return result
+
+
+def _strict(kind: type) -> Any:
+    accepted = (int, float) if kind is float else kind
+
+    def structure(value: Any, _: Any) -> Any:
+        if kind is float and isinstance(value, str):  # YAML takes 3e-4, without a point, for a word
+            with contextlib.suppress(ValueError):
+                return float(value)
+        if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
+            raise ValueError(f"{value!r} is not of type {kind.__name__}")
+        return kind(value)
+
+    return structure
+
+
+def _refuse_unknown_keys(cls: type, values: Any, where: str, prefix: str) -> None:
+    import typing
+
+    if not isinstance(values, dict):
+        raise ConfigError(f"{where}: {prefix.rstrip('.')} must hold `key: value` pairs")
+    hints = typing.get_type_hints(cls)
+    known = {f.name: hints[f.name] for f in dataclasses.fields(cls)}
+    for key, value in values.items():
+        if key not in known:
+            close = difflib.get_close_matches(str(key), known, n=1)
+            mend = f"did you mean `{prefix}{close[0]}`?" if close else f"known: {', '.join(known)}"
+            raise ConfigError(f"{where}: unknown setting `{prefix}{key}`; {mend}")
+        if dataclasses.is_dataclass(known[key]):
+            _refuse_unknown_keys(known[key], value, where, f"{prefix}{key}.")
+
+
+def _first_reason(error: Any) -> str:
+    """The innermost message of a nested validation error, with the path to the field."""
+    path: list[str] = []
+    while getattr(error, "exceptions", None):
+        error = error.exceptions[0]
+        path += [str(note).rsplit(" ", 1)[-1] for note in getattr(error, "__notes__", []) if "attribute" in note]
+    return f"setting `{'.'.join(path)}`: {error}" if path else str(error)

@@ -1,0 +1,33 @@
+"""The exceptions of improvo: one base, caught once by the command line."""
+
+
+class ImprovoError(Exception):
+    """Something a user can mend.
+
+    The message is one line that names the file or setting, says what is wrong with it, and how to mend it.
+    The command line prints it and exits with status 2.
+    """
+
+
+class InputError(ImprovoError):
+    """An input (recording, calibration, trajectory, weights, ...) is missing, unreadable or inconsistent."""
+
+
+class OutputError(ImprovoError):
+    """An output folder or file cannot be used or written."""
+
+
+class ConfigError(ImprovoError):
+    """A setting has an unknown name or an impossible value."""
+
+
+class MissingExtraError(ImprovoError):
+    """A command needs an optional dependency.
+
+    Args:
+        feature: what was asked for, in the user's words ("training").
+        extra: the name of the extra that provides it ("train").
+    """
+
+    def __init__(self, feature: str, extra: str) -> None:
+        super().__init__(f"{feature} needs an optional dependency: pip install 'improvo[{extra}]'")

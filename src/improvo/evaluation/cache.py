@@ -1,0 +1,125 @@
+"""Features of the frames of one sequence by one frontend, computed once, kept on disk, read by all processes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from improvo.errors import InputError, OutputError
+from improvo.types import Features, Float32, Int64
+
+FORMAT = 1
+_ARRAYS = ("keypoints", "descriptors", "scores", "stability")
+
+
+@dataclass(frozen=True)
+class FeatureCache:
+    """An opened cache: flat arrays, mapped into memory, so that processes share one copy."""
+
+    rows: dict[int, tuple[int, int]]  # frame -> first and last + 1 row
+    keypoints: Float32
+    descriptors: NDArray[np.generic]
+    scores: Float32
+    stability: Float32 | None
+
+    def __contains__(self, frame: int) -> bool:
+        return frame in self.rows
+
+    def __getitem__(self, frame: int) -> Features:
+        start, end = self.rows[frame]
+        stability = None if self.stability is None else np.array(self.stability[start:end])
+        return Features(
+            np.array(self.keypoints[start:end]),
+            np.array(self.descriptors[start:end]),
+            np.array(self.scores[start:end]),
+            stability,
+        )
+
+
+def read_cache(folder: Path, fingerprint: dict[str, Any] | None = None) -> FeatureCache | None:
+    """The cache in `folder`, or None if there is none.
+
+    Args:
+        folder: of one frontend and one sequence.
+        fingerprint: all that decides the features; must be the one that the cache was made with. None: not checked.
+
+    Raises:
+        InputError: the cache was made with other settings (names the first that differs), or is damaged.
+    """
+    index_file = folder / "index.json"
+    if not index_file.is_file():
+        return None
+    try:
+        index = json.loads(index_file.read_text())
+        made_with, frames, ends = index["fingerprint"], index["frames"], index["ends"]
+        format_version = index["format"]
+        arrays = {
+            name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
+            for name in _ARRAYS
+            if (folder / f"{name}.npy").is_file()
+        }
+        keypoints, descriptors, scores = arrays["keypoints"], arrays["descriptors"], arrays["scores"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{folder}: is a damaged feature cache; delete that folder") from None
+    now = made_with if fingerprint is None else json.loads(json.dumps(fingerprint))
+    difference = _first_difference({"format": format_version, **made_with}, {"format": FORMAT, **now})
+    if difference:
+        raise InputError(
+            f"{folder}: features were cached with {difference}; delete that folder, or give another output folder"
+        )
+    if not len(keypoints) == len(descriptors) == len(scores) == (ends[-1] if ends else 0):
+        raise InputError(f"{folder}: is a damaged feature cache; delete that folder")
+    starts = [0, *ends[:-1]]
+    rows = {int(frame): (start, end) for frame, start, end in zip(frames, starts, ends, strict=True)}
+    return FeatureCache(rows, keypoints, descriptors, scores, arrays.get("stability"))
+
+
+def write_cache(folder: Path, fingerprint: dict[str, Any], features: dict[int, Features]) -> None:
+    """Write a cache; `folder` appears complete or not at all, and replaces what was there.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    frames = sorted(features)
+    ends: Int64 = np.cumsum([len(features[frame]) for frame in frames]).astype(np.int64)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        try:
+            for name in _ARRAYS:
+                parts = [getattr(features[frame], name) for frame in frames]
+                if parts and all(part is not None for part in parts):
+                    np.save(temporary / f"{name}.npy", np.concatenate(parts), allow_pickle=False)
+            index = {"format": FORMAT, "fingerprint": fingerprint, "frames": frames, "ends": ends.tolist()}
+            (temporary / "index.json").write_text(json.dumps(index))
+            if folder.exists():
+                shutil.rmtree(folder)
+            temporary.rename(folder)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written ({error.strerror or error}); choose another folder") from None
+
+
+def _first_difference(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> str:
+    for key in sorted({*old, *new}):
+        a, b = old.get(key), new.get(key)
+        if isinstance(a, dict) and isinstance(b, dict):
+            nested = _first_difference(a, b, f"{prefix}{key}.")
+            if nested:
+                return nested
+        elif a != b:
+            return f"{prefix}{key} {_short(a)}, this run has {_short(b)}"
+    return ""
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."

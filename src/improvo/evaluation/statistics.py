@@ -1,0 +1,50 @@
+"""Accuracy over thresholds, the area under it, and bootstrap intervals."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from improvo.types import Float64
+
+
+def below(errors: Float64, threshold: float) -> NDArray[np.bool_]:
+    """Which `errors` (N,) are strictly below the threshold, as in the paper's "< 5"; a failure is an error of inf."""
+    return np.asarray(errors < threshold)
+
+
+def accuracy_curve(errors: Float64, thresholds: Float64) -> Float64:
+    """Share of `errors` (N,) strictly below each of `thresholds` (T,)."""
+    return np.searchsorted(np.sort(errors), thresholds, side="left") / len(errors)
+
+
+def area_shares(errors: Float64, limit: float) -> Float64:
+    """What each error adds to the area under the accuracy curve from 0 to `limit`, divided by `limit`.
+
+    Their mean is the area, exactly: an error e is counted from e to the limit. 1 where no error is left.
+    """
+    return np.clip(1.0 - errors / limit, 0.0, None)
+
+
+class Bootstrap:
+    """Percentile intervals of means over the same resamples of the same trials (Efron 1979).
+
+    One object serves every frontend, so that differences between frontends are taken over paired resamples.
+
+    Args:
+        count: number of trials.
+        seed: of the resamples.
+        resamples: how many.
+        confidence: of the interval.
+    """
+
+    def __init__(self, count: int, seed: int, resamples: int = 1000, confidence: float = 0.95) -> None:
+        rng = np.random.default_rng(seed)
+        shares = np.full(count, 1.0 / count)
+        self._weights = rng.multinomial(count, shares, size=resamples).astype(np.float32) / np.float32(count)
+        self._percentiles = [50 * (1 - confidence), 50 * (1 + confidence)]
+
+    def interval(self, values: NDArray[np.generic]) -> tuple[float, float]:
+        """Interval of the mean of finite `values` (N,)."""
+        low, high = np.percentile(self._weights @ values.astype(np.float32), self._percentiles)
+        return float(low), float(high)

@@ -1,0 +1,128 @@
+"""Trajectory errors as Markdown, laid out like the paper's Table 2."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from improvo.evaluation.tables import bold_best, columns_to_rows, markdown, significant
+
+MANY_SEGMENTS = 10
+
+
+def sub_trajectory_table(results: dict[str, dict[str, Any]], unit: str = "s") -> str:
+    """Table 2: mean rotation and translation error per sub-trajectory length, one row per run, best in bold.
+
+    Args:
+        results: name of the row -> trajectory errors as plain data (`trajectory.json`).
+        unit: of the lengths: "s", "m" or "path".
+    """
+    first = next(iter(results.values()))
+    lengths = [row["length"] for row in first["relative"] if row["unit"] == unit]
+    if not lengths:
+        return ""
+    windows = {name: [r for r in result["relative"] if r["unit"] == unit] for name, result in results.items()}
+    shown = [_length(length, unit) for length in lengths]
+    header = ["Sub-trajectory length", *(f"{s} (°)" for s in shown), *(f"{s} (cm)" for s in shown)]
+    if unit != "s":
+        header += [f"{s} (%)" for s in shown]
+    none = ["No prediction"]
+    columns: list[list[str]] = []
+    fields = [("rotation_deg", 1.0), ("translation_m", 100.0)]
+    for field, factor in fields:
+        for i in range(len(lengths)):
+            still = _first_known([rows[i][f"no_prediction_{field}"] for rows in windows.values()])
+            none.append(significant(None if still is None else factor * still))
+            values = [factor * rows[i][field]["mean"] if rows[i][field] else None for rows in windows.values()]
+            cells = [significant(value) for value in values]
+            columns.append(bold_best(cells, values, largest=False) if len(values) > 1 else cells)
+    if unit != "s":
+        for i in range(len(lengths)):
+            none.append("")
+            shares = [rows[i]["translation_percent"] for rows in windows.values()]
+            columns.append([significant(share) for share in shares])
+    notes = {f"- {name}: {row['note']}" for name, rows in windows.items() for row in rows if row["note"]}
+    table = markdown(header, [none, *columns_to_rows(list(results), columns)])
+    return "\n\n".join([table, *(["\n".join(sorted(notes))] if notes else [])])
+
+
+def trajectory_tables(result: dict[str, Any], name: str) -> str:
+    """One evaluation as Markdown: what was compared, ATE, segments, Table 2 by time, distance and share of path."""
+    lines = [
+        f"{result['poses']} poses at a common time, of {result['estimate_poses']} estimated and "
+        f"{result['truth_poses']} true ones; {result['path_m']:.4g} m of path; alignment {result['alignment']}"
+        + (", each segment on its own." if len(result["segments"]) > 1 else ".")
+    ]
+    invalid = result["invalid_truth"]
+    if invalid:
+        named = ", ".join(f"{time:.3f}" for time in invalid[:5]) + (", …" if len(invalid) > 5 else "")
+        lines.append(f"Left out: {len(invalid)} true poses that are missing, NaN or not rigid (at {named} s).")
+    parts = ["\n".join(lines), _absolute(result)]
+    for unit in ("s", "m", "path"):
+        table = sub_trajectory_table({name: result}, unit)
+        if table:
+            parts.append(table)
+    return "\n\n".join(parts) + "\n"
+
+
+def vo_tables(results: dict[str, Any]) -> str:
+    """`vo.json` as Markdown: Table 2 over all sequences, and what each sequence gave."""
+    named = {f"{row['frontend']} {row['variant']}".strip(): row for row in results["rows"]}
+    parts = [sub_trajectory_table(named, "s"), sub_trajectory_table(named, "m")]
+    header = ["Sequence, frontend", "frames", "with pose", "segments", "ATE (m)", "ATE (% of path)"]
+    rows = []
+    for row in results["sequence_rows"]:
+        errors = row["errors"]
+        ate = errors["ate_m"] if errors else None
+        figures = [significant(ate["rmse"] if ate else None), significant(errors["ate_percent"] if errors else None)]
+        label = f"{row['sequence']}, {row['frontend']} {row['variant']}".strip()
+        segments = str(len(errors["segments"])) if errors else "0"
+        rows.append([label, str(row["frames"]), str(row["tracked"]), segments, *figures])
+    parts.append(markdown(header, rows))
+    notes = [
+        f"- {row['sequence']}, {row['frontend']}: {row['note']}" for row in results["sequence_rows"] if row["note"]
+    ]
+    notes += [f"- {entry['sequence']} left out: {entry['reason']}" for entry in results["excluded"]]
+    notes += [
+        f"- {row['frontend']} has no stability head: all weights are 1" for row in results["rows"] if not row["variant"]
+    ]
+    return "\n\n".join(part for part in [*parts, "\n".join(notes)] if part) + "\n"
+
+
+def _absolute(result: dict[str, Any]) -> str:
+    header = [
+        "Absolute trajectory error",
+        "poses",
+        "path (m)",
+        "scale",
+        "rmse (m)",
+        "median",
+        "max",
+        "% of path",
+        "rot. (°)",
+    ]
+    rows = []
+    everything = {"poses": result["poses"], "scale": None, **result, "note": ""}
+    entries = [(f"segment {s['segment']}", s) for s in result["segments"][:MANY_SEGMENTS]]
+    if len(entries) == 1:
+        everything["scale"] = result["segments"][0]["scale"]
+        entries = []
+    for label, entry in [*entries, ("all", everything)]:
+        ate = entry["ate_m"]
+        if ate is None:
+            rows.append([label, str(entry["poses"]), f"{entry['path_m']:.4g}", *["-"] * 6])
+            continue
+        figures = [entry["scale"], ate["rmse"], ate["median"], ate["maximum"], entry["ate_percent"]]
+        figures.append(entry["rotation_deg"]["rmse"])
+        rows.append([label, str(entry["poses"]), f"{entry['path_m']:.4g}", *map(significant, figures)])
+    notes = [f"- segment {s['segment']}: {s['note']}" for s in result["segments"][:MANY_SEGMENTS] if s["note"]]
+    if len(result["segments"]) > MANY_SEGMENTS:
+        notes.append(f"- {len(result['segments']) - MANY_SEGMENTS} further segments are in the JSON")
+    return "\n\n".join([markdown(header, rows), *(["\n".join(notes)] if notes else [])])
+
+
+def _length(length: float, unit: str) -> str:
+    return f"{100 * length:g} % path" if unit == "path" else f"{length:g} {'sec' if unit == 's' else 'm'}"
+
+
+def _first_known(values: list[float | None]) -> float | None:
+    return next((value for value in values if value is not None), None)

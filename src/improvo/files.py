@@ -1,0 +1,84 @@
+"""Output that is never half-written, and output folders that are ours."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from improvo.errors import OutputError
+
+MARKER = ".improvo.json"
+FORMER_NAME = "sivo"  # of this package; folders and weights written under it stay readable
+
+
+@contextmanager
+def written_atomically(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` to write to; it replaces `path` when the block ends, and vanishes if it fails."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}); choose another folder") from None
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically."""
+    with written_atomically(path) as temporary:
+        temporary.write_text(text)
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write JSON atomically, indented, with NaN refused (use None)."""
+    write_text(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
+
+
+def check_output_folder(path: Path, command: str) -> None:
+    """Refuse a folder that `command` did not make, before any work is done.
+
+    Raises:
+        OutputError: the path is a file, a folder with other content, or cannot be written.
+    """
+    if path.exists() and not path.is_dir():
+        raise OutputError(f"{path}: is a file, not a folder; choose another output folder")
+    if path.is_dir() and any(not _is_temporary(entry) for entry in path.iterdir()):
+        owner = _owner(path)
+        if owner != command:
+            made_by = f"was made by `improvo {owner}`" if owner else "has files that improvo did not write"
+            raise OutputError(f"{path}: exists and {made_by}; choose an empty or new output folder")
+    existing = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise OutputError(f"{path}: no permission to write in {existing}; choose another output folder")
+
+
+def make_output_folder(path: Path, command: str) -> None:
+    """Create the folder and mark it as made by `command` (checked first, see `check_output_folder`)."""
+    check_output_folder(path, command)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be created ({error.strerror}); choose another output folder") from None
+    write_json(path / MARKER, {"made_by": command})
+
+
+def _is_temporary(path: Path) -> bool:
+    """Whether `written_atomically` left this, in a process that was killed; it may have been the first file of all."""
+    return path.name.startswith(".") and ".partial" in path.suffixes
+
+
+def _owner(path: Path) -> str | None:
+    """The command that made a folder; None where no marker says so."""
+    for name in (MARKER, f".{FORMER_NAME}.json"):
+        try:
+            marker = json.loads((path / name).read_text())
+        except (OSError, ValueError):
+            continue
+        if isinstance(marker, dict):
+            return marker.get("made_by")
+    return None

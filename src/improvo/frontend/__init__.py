@@ -1,0 +1,17 @@
+"""Images in, `Features` out: classical detectors and the network, behind one interface."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from improvo.types import Features, UInt8
+
+
+class Frontend(Protocol):
+    """What the odometry, the labels and the evaluation need of a frontend."""
+
+    name: str  # as given to `load_frontend`; goes into run.json
+
+    def __call__(self, image: UInt8) -> Features:
+        """Features of one image (H, W) or (H, W, 3) uint8, best score first; deterministic."""
+        ...

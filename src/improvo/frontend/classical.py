@@ -1,0 +1,164 @@
+"""SIFT, ORB, AKAZE and SURF behind the `Frontend` interface.
+
+The paper compares with "the default OpenCV implementation" of each; that is what `sensitive=False` gives. Odometry
+needs points on weakly textured walls and doors too, so `sensitive=True` lowers the detection threshold: the best
+`max_keypoints` are kept all the same, so that only images with too few points change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+
+from improvo.errors import ConfigError
+from improvo.types import Features, Float32, Int64, UInt8
+
+_opencv: Any = cv2  # its type stubs lack the detectors' constructors
+_ORB_CANDIDATES = 4  # times max_keypoints; ORB's own choice of the strongest clusters on few structures
+
+
+class ClassicalFrontend:
+    """One of OpenCV's detectors with its descriptor.
+
+    Args:
+        name: `sift`, `orb` or `akaze`.
+        max_keypoints: keep at most this many, strongest first.
+        sensitive: lower the detection threshold.
+        spread: pick ORB's points evenly over the image instead of the strongest.
+
+    Raises:
+        ConfigError: an unknown name.
+    """
+
+    def __init__(self, name: str, max_keypoints: int = 1000, sensitive: bool = False, spread: bool = False) -> None:
+        if name not in _DETECTORS:
+            raise ConfigError(f"frontend {name!r}: unknown; choose among {', '.join(_DETECTORS)}")
+        self.name = name
+        self._max_keypoints = max_keypoints
+        self._spread = spread
+        candidates = max_keypoints * (_ORB_CANDIDATES if spread else 1)
+        self._detector = _DETECTORS[name](candidates, sensitive)
+
+    def __call__(self, image: UInt8) -> Features:
+        """Features of one image (H, W) or (H, W, 3) BGR, uint8."""
+        grey = to_grey(image)
+        cv2.setRNGSeed(0)  # some detectors sample; the same image must give the same features
+        found = self._detector.detect(grey, None)
+        order, pixels = _best_first(found)
+        if self._spread:
+            order = order[spread_over_image(pixels[order], grey.shape, self._max_keypoints)]
+        found = [found[i] for i in order[: self._max_keypoints].tolist()]
+        found, descriptors = self._detector.compute(grey, found)
+        if not found:
+            return self._nothing()
+        keypoints = np.array([keypoint.pt for keypoint in found], np.float32)
+        scores = np.array([keypoint.response for keypoint in found], np.float32)
+        best_first = np.argsort(-scores, kind="stable")[: self._max_keypoints]
+        if descriptors.dtype != np.uint8:
+            descriptors = unit_rows(descriptors)
+        return Features(keypoints, descriptors, scores).take(best_first)
+
+    def _nothing(self) -> Features:
+        binary = self._detector.descriptorType() == cv2.CV_8U
+        width = self._detector.descriptorSize()
+        descriptors = np.zeros((0, width), np.uint8 if binary else np.float32)
+        return Features(np.zeros((0, 2), np.float32), descriptors, np.zeros(0, np.float32))
+
+
+class SurfFrontend:
+    """SURF (Bay 2008), from OpenCV where the build has it, else from mahotas.
+
+    OpenCV's pre-built packages leave SURF out.
+    """
+
+    name = "surf"
+
+    def __init__(self, max_keypoints: int = 1000, sensitive: bool = False) -> None:
+        self._max_keypoints = max_keypoints
+        self._threshold = 0.01 if sensitive else 0.1
+        self._opencv = _opencv_surf(30.0 if sensitive else 100.0)
+
+    def __call__(self, image: UInt8) -> Features:
+        """Features of one image (H, W) or (H, W, 3) BGR, uint8."""
+        grey = to_grey(image)
+        rows = self._with_mahotas(grey) if self._opencv is None else self._with_opencv(grey)
+        keypoints, scores, descriptors = rows
+        best_first = np.argsort(-scores, kind="stable")[: self._max_keypoints]
+        return Features(keypoints, unit_rows(descriptors), scores).take(best_first)
+
+    def _with_mahotas(self, grey: UInt8) -> tuple[Float32, Float32, Float32]:
+        from mahotas.features import surf
+
+        rows = surf.surf(grey, threshold=self._threshold, max_points=self._max_keypoints)
+        # rows are y, x, scale, score, laplacian, angle, 64 descriptor values
+        return rows[:, 1::-1].astype(np.float32), rows[:, 3].astype(np.float32), rows[:, 6:].astype(np.float32)
+
+    def _with_opencv(self, grey: UInt8) -> tuple[Float32, Float32, Float32]:
+        assert self._opencv is not None
+        found, descriptors = self._opencv.detectAndCompute(grey, None)
+        if not found:
+            return np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, 64), np.float32)
+        keypoints = np.array([keypoint.pt for keypoint in found], np.float32)
+        return keypoints, np.array([keypoint.response for keypoint in found], np.float32), descriptors
+
+
+def to_grey(image: UInt8) -> UInt8:
+    """(H, W) or (H, W, 3) BGR uint8 -> (H, W) uint8."""
+    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+
+
+def unit_rows(descriptors: Float32) -> Float32:
+    """Rows scaled to unit L2 norm; zero rows stay zero."""
+    norms = np.linalg.norm(descriptors, axis=1, keepdims=True)
+    return (descriptors / np.maximum(norms, 1e-12)).astype(np.float32)
+
+
+def _best_first(found: Sequence[Any]) -> tuple[Int64, Float32]:
+    """Order of OpenCV's keypoints by response, ties by place and angle; and their pixels (N, 2)."""
+    pixels = np.asarray(cv2.KeyPoint.convert(found), np.float32).reshape(-1, 2)
+    angles = np.array([keypoint.angle for keypoint in found])
+    responses = np.array([keypoint.response for keypoint in found])
+    return np.lexsort((angles, pixels[:, 1], pixels[:, 0], -responses)), pixels
+
+
+def spread_over_image(pixels: Float32, shape: tuple[int, ...], count: int) -> Int64:
+    """Indices of up to `count` pixels (N, 2), sorted best first, taken in turn from the cells of a grid.
+
+    Each cell gives its best point, then its second best and so on, so that a weakly textured part of the image keeps
+    some points.
+    """
+    cell = max(8.0, float(np.sqrt(shape[0] * shape[1] / max(count, 1)) * 2))
+    columns = int(shape[1] // cell) + 1
+    cells = (pixels[:, 1] // cell).astype(np.int64) * columns + (pixels[:, 0] // cell).astype(np.int64)
+    order = np.argsort(cells, kind="stable")
+    starts = np.searchsorted(cells[order], cells[order])
+    rank = np.empty(len(pixels), np.int64)
+    rank[order] = np.arange(len(pixels)) - starts  # 0 for the best of its cell
+    return np.argsort(rank, kind="stable")[:count]
+
+
+def _sift(count: int, sensitive: bool) -> Any:
+    return _opencv.SIFT_create(nfeatures=count, contrastThreshold=0.01 if sensitive else 0.04)
+
+
+def _orb(count: int, sensitive: bool) -> Any:
+    return _opencv.ORB_create(nfeatures=count, fastThreshold=5 if sensitive else 20)
+
+
+def _akaze(count: int, sensitive: bool) -> Any:
+    # OpenCV 5 moved AKAZE to the contrib module
+    create = getattr(_opencv, "AKAZE_create", None) or _opencv.xfeatures2d.AKAZE_create
+    return create(threshold=1e-4 if sensitive else 1e-3)
+
+
+def _opencv_surf(hessian_threshold: float) -> Any | None:
+    try:
+        return _opencv.xfeatures2d.SURF_create(hessian_threshold)
+    except (AttributeError, cv2.error):
+        return None
+
+
+_DETECTORS: dict[str, Callable[[int, bool], Any]] = {"sift": _sift, "orb": _orb, "akaze": _akaze}

@@ -1,0 +1,166 @@
+"""Public SuperPoint weights into ours: the three layouts in circulation, recognised by the names of their tensors.
+
+They differ in where batch norm sits: nowhere (the original release), before the ReLU, or after it. None has a
+stability head.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from improvo.errors import ConfigError, InputError, MissingExtraError
+from improvo.frontend.architecture import Architecture, Normalisation
+from improvo.frontend.weights import ModelCard, Weights
+from improvo.types import Float32, Float64
+
+Tensors = Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How one public implementation names its layers."""
+
+    name: str
+    normalisation: Normalisation
+    norm_epsilon: float
+    names: dict[str, tuple[str, str]]  # our layer -> their convolution and batch norm
+
+    def fits(self, tensors: Tensors) -> bool:
+        """Whether all of its convolutions are there."""
+        return all(f"{convolution}.weight" in tensors for convolution, _ in self.names.values())
+
+
+def _plain(norms: bool) -> dict[str, tuple[str, str]]:
+    """`convPa` and `bnPa`, `convPb`, ... of the heads; `conv1a` to `conv4b` of the encoder."""
+    encoder = [f"{stage}{half}" for stage in "1234" for half in "ab"]
+    ours = {f"encoder.{position}": name for position, name in enumerate(encoder)}
+    ours |= {"detector.0": "Pa", "detector.1": "Pb", "descriptor.0": "Da", "descriptor.1": "Db"}
+    return {layer: (f"conv{name}", f"bn{name}" if norms else "") for layer, name in ours.items()}
+
+
+def _stages() -> dict[str, tuple[str, str]]:
+    """`inc` and `down1` to `down3`, each a sequence: convolution, norm, ReLU, convolution, norm, ReLU."""
+    stages = ["inc.conv", *(f"down{stage}.mpconv.1" for stage in (1, 2, 3))]
+    encoder = [(f"{stage}.conv.{first}", f"{stage}.conv.{first + 1}") for stage in stages for first in (0, 3)]
+    return {f"encoder.{position}": names for position, names in enumerate(encoder)}
+
+
+def _blocks() -> dict[str, tuple[str, str]]:
+    """`backbone.STAGE.HALF`, `detector.N`, `descriptor.N`, each with `conv` and `bn`."""
+    ours = {f"encoder.{2 * stage + half}": f"backbone.{stage}.{half}" for stage in range(4) for half in (0, 1)}
+    ours |= {f"{head}.{part}": f"{head}.{part}" for head in ("detector", "descriptor") for part in (0, 1)}
+    return {layer: (f"{name}.conv", f"{name}.bn") for layer, name in ours.items()}
+
+
+LAYOUTS = (
+    Layout("no batch norm (original release)", "none", 0.0, _plain(norms=False)),
+    Layout("batch norm before ReLU", "before_relu", 1e-5, {**_plain(norms=True), **_stages()}),
+    Layout("batch norm after ReLU", "after_relu", 1e-3, _blocks()),
+)
+
+
+def read_public_file(path: Path) -> dict[str, NDArray[Any]]:
+    """Tensors of a `.safetensors` or torch file; nothing but tensors is unpickled.
+
+    Raises:
+        InputError: missing, unreadable, or holding more than tensors.
+        MissingExtraError: a torch file without torch installed.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the weights file of a public SuperPoint")
+    try:
+        if path.suffix == ".safetensors":
+            from safetensors.numpy import load_file
+
+            return dict(load_file(path))
+        try:
+            import torch
+        except ImportError:
+            raise MissingExtraError("reading a torch file", "train") from None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of pickle protocols, when the file is no torch file at all
+            checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except MissingExtraError:
+        raise
+    except Exception as error:  # torch and safetensors raise many kinds, from RuntimeError to UnpicklingError
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{path}: not readable as a file of tensors ({reason}); save its state_dict alone") from None
+    return {
+        name.removeprefix("module."): values.float().numpy()
+        for name, values in _state_dict(path, checkpoint).items()
+        if isinstance(values, torch.Tensor)
+    }
+
+
+def _state_dict(path: Path, checkpoint: Any) -> dict[str, Any]:
+    for key in ("model_state_dict", "state_dict", "model"):
+        if isinstance(checkpoint, dict) and isinstance(checkpoint.get(key), dict):
+            checkpoint = checkpoint[key]
+    if not isinstance(checkpoint, dict):
+        raise InputError(f"{path}: holds a {type(checkpoint).__name__}, not a state_dict; save its state_dict alone")
+    return checkpoint
+
+
+def convert(tensors: Tensors, source: str, licence: str) -> tuple[Weights, Layout]:
+    """Public tensors as ours. The batch norm behind a last 1×1 convolution is folded into it, the others are kept.
+
+    Args:
+        tensors: as `read_public_file` gives them.
+        source: where they come from, for messages and the model card.
+        licence: goes into the model card.
+
+    Raises:
+        InputError: none of the three layouts, or tensors missing from it.
+    """
+    layout = next((layout for layout in reversed(LAYOUTS) if layout.fits(tensors)), None)
+    if layout is None:
+        known = "; ".join(layout.name for layout in LAYOUTS)
+        raise InputError(f"{source}: not a SuperPoint layout that is known here ({known}); export it in one of these")
+    try:
+        ours: dict[str, Float32] = {}
+        for layer, (convolution, norm) in layout.names.items():
+            ours.update(_layer(tensors, layer, convolution, norm, layout))
+        architecture = _architecture(ours, layout)
+        return Weights(ModelCard(architecture, licence, notes=f"converted from {source} ({layout.name})"), ours), layout
+    except KeyError as error:
+        raise InputError(f"{source}: {layout.name}: tensor {error.args[0]} is missing; the file is not whole") from None
+    except (ValueError, ConfigError) as error:
+        raise InputError(f"{source}: {layout.name}: shapes that do not fit together ({error})") from None
+
+
+def _layer(tensors: Tensors, layer: str, convolution: str, norm: str, layout: Layout) -> dict[str, Float32]:
+    weight: Float64 = tensors[f"{convolution}.weight"].astype(np.float64)
+    bias: Float64 = tensors[f"{convolution}.bias"].astype(np.float64)
+    kept: dict[str, Any] = {}
+    if layout.normalisation != "none":
+        parts = {part: tensors[f"{norm}.{part}"] for part in ("weight", "bias", "running_mean", "running_var")}
+        if layer.endswith(".1") and not layer.startswith("encoder"):  # no ReLU there: the norm is part of the layer
+            scale = parts["weight"] / np.sqrt(parts["running_var"].astype(np.float64) + layout.norm_epsilon)
+            weight = weight * scale[:, None, None, None]
+            bias = (bias - parts["running_mean"]) * scale + parts["bias"]
+        else:
+            kept = {f"{layer}.norm.{part}": values for part, values in parts.items()}
+    kept |= {f"{layer}.convolution.weight": weight, f"{layer}.convolution.bias": bias}
+    return {name: np.asarray(values, np.float32) for name, values in kept.items()}
+
+
+def _architecture(tensors: dict[str, Float32], layout: Layout) -> Architecture:
+    def width(layer: str) -> int:
+        return len(tensors[f"{layer}.convolution.weight"])
+
+    return Architecture(
+        "superpoint",
+        encoder=tuple(width(f"encoder.{position}") for position in range(8)),
+        head=width("detector.0"),
+        descriptor=width("descriptor.1"),
+        stability=False,
+        normalisation=layout.normalisation,
+        norm_epsilon=layout.norm_epsilon or Architecture.norm_epsilon,
+    )

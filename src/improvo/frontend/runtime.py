@@ -1,0 +1,59 @@
+"""What runs a network: one interface over OpenVINO (the default, without torch) and torch."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+from improvo.errors import ConfigError
+from improvo.frontend.live_channels import without_dead_channels
+from improvo.frontend.settings import NetworkSettings
+from improvo.frontend.weights import Weights
+from improvo.types import Float32
+
+
+class NetworkMaps(NamedTuple):
+    """The network's answer for a batch; the arrays may be overwritten by the next call of the runtime."""
+
+    heat: Float32  # (B, H, W) keypoint probability of every pixel: softmax over a cell, dustbin dropped
+    descriptors: Float32  # (B, Hc, Wc, D) one per cell, not normalised
+    stability_logits: Float32 | None  # (B, Hc, Wc, 2), the second is "stable"; None without a stability head
+
+
+class Runtime(Protocol):
+    """Runs one network on batches of images."""
+
+    name: str  # library and precision, such as "openvino-float32"
+
+    def __call__(self, images: Float32) -> NetworkMaps:
+        """Maps of (B, 1, H, W) images in [0, 1] with sides that are multiples of 8."""
+        ...
+
+
+def open_runtime(weights: Weights, settings: NetworkSettings) -> Runtime:
+    """The runtime that the settings ask for.
+
+    Raises:
+        ConfigError: a precision that the runtime or the weights do not have.
+        MissingExtraError: the runtime's library is not installed.
+    """
+    weights = without_dead_channels(weights)
+    name = settings.runtime
+    if name == "auto":
+        name = "torch" if settings.device == "cuda" or settings.precision == "float16" else "openvino"
+    if name == "torch":
+        from improvo.frontend.runtime_torch import TorchRuntime
+
+        if settings.precision == "int8":
+            raise ConfigError("setting `precision`: int8 runs in runtime=openvino, not in torch")
+        half = settings.precision == "float16" or (settings.precision == "auto" and settings.device == "cuda")
+        return TorchRuntime(weights, device=settings.device, half=half, threads=settings.threads)
+    from improvo.frontend.runtime_openvino import OpenVinoRuntime
+
+    if settings.precision == "float16":
+        raise ConfigError("setting `precision`: float16 runs in runtime=torch, not in openvino")
+    calibrated = bool(weights.card.activation_ranges)
+    if settings.precision == "int8" and not calibrated:
+        raise ConfigError(
+            "setting `precision`: int8 needs weights with activation ranges; `improvo weights calibrate` adds them"
+        )
+    return OpenVinoRuntime(weights, int8=calibrated and settings.precision != "float32", threads=settings.threads)

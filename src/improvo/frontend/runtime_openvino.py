@@ -1,0 +1,155 @@
+"""The default runtime: the network as an OpenVINO graph, built from the weights file without torch or ONNX."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import openvino as ov
+from openvino import opset13 as ops
+
+from improvo.frontend.architecture import CELL, POOL_AFTER
+from improvo.frontend.runtime import NetworkMaps
+from improvo.frontend.weights import Weights
+from improvo.types import Float32
+
+INT8_MAX = 127
+INT8_IMAGE_COPIES = 4
+INT8_LAST_LAYERS = ("descriptor.1",)  # of the 1×1 convolutions; rounding the detector's moves keypoints
+
+
+class OpenVinoRuntime:
+    """Runs a network on the CPU with OpenVINO.
+
+    Args:
+        weights: of any architecture.
+        int8: compute all but the detector's and the stability head's last layer in eight bits, by the activation
+            ranges of the model card.
+        threads: 0 for as many as the machine has.
+
+    One graph is compiled for each image size and kept. Not to be called from several threads at once.
+    """
+
+    def __init__(self, weights: Weights, int8: bool = False, threads: int = 0) -> None:
+        self.name = "openvino-int8" if int8 else "openvino-float32"
+        self._graph = _Graph(weights, weights.card.activation_ranges if int8 else {})
+        # Left to itself, OpenVINO may compute in bfloat16 and in several streams: other numbers on other machines.
+        self._options: dict[str, Any] = {"INFERENCE_PRECISION_HINT": "f32", "NUM_STREAMS": 1}
+        if threads:
+            self._options["INFERENCE_NUM_THREADS"] = threads
+        self._core = ov.Core()
+        self._requests: dict[tuple[int, ...], Any] = {}
+
+    def __call__(self, images: Float32) -> NetworkMaps:
+        """Maps of (B, 1, H, W) images in [0, 1] with sides that are multiples of 8."""
+        request = self._requests.get(images.shape)
+        if request is None:
+            compiled = self._core.compile_model(self._graph.model(images.shape), "CPU", self._options)
+            request = self._requests[images.shape] = compiled.create_infer_request()
+        maps = request.infer([images], share_inputs=True, share_outputs=True)
+        return NetworkMaps(maps[0][:, 0], maps[1], maps[2] if len(maps) > 2 else None)
+
+
+def activation_ranges(weights: Weights, images: Float32, quantile: float) -> dict[str, float]:
+    """The `quantile` of what each convolution reads over (B, 1, H, W) images, by the name of the one that reads it."""
+    graph = _Graph(weights, {})
+    compiled = ov.Core().compile_model(graph.model(images.shape, taps=True), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+    found = compiled([images])
+    return {reader: float(np.quantile(found[position], quantile)) for position, reader in enumerate(graph.readers)}
+
+
+class _Graph:
+    """Builds the network's graph, layer by layer.
+
+    Activations are quantised where the layer that reads them is: `ranges` has their largest value by that layer's name
+    (`heads` for what the heads share), and is empty for float32.
+    """
+
+    def __init__(self, weights: Weights, ranges: dict[str, float]) -> None:
+        self._layers = {layer.convolution.name: layer for layer in weights.folded()}
+        self._heads = weights.architecture.heads
+        self._ranges = {**ranges, "encoder.0": 1.0} if ranges else {}
+        self.readers = [*(f"encoder.{layer}" for layer in range(1, 8)), "heads", *(f"{head}.1" for head in self._heads)]
+
+    def model(self, shape: tuple[int, ...], taps: bool = False) -> Any:
+        """The model for images of `shape` (B, 1, H, W); with `taps`, it puts out what each of `readers` reads."""
+        image = ops.parameter(list(shape), np.float32, name="image")
+        read: dict[str, Any] = {}
+        node = self._quantised("encoder.0", image)
+        for position in range(8):
+            node = self._convolution(f"encoder.{position}", node)
+            reader = f"encoder.{position + 1}" if position < 7 else "heads"
+            node = self._quantised(reader, node)  # before the pool, which is then done in eight bits too
+            if position in POOL_AFTER:
+                node = ops.max_pool(node, [2, 2], [1, 1], [0, 0], [0, 0], [2, 2]).output(0)
+            read[reader] = node
+        heads: dict[str, Any] = {}
+        for head in self._heads:
+            reader = f"{head}.1"
+            read[reader] = self._convolution(f"{head}.0", node)
+            if reader in INT8_LAST_LAYERS:
+                read[reader] = self._quantised(reader, read[reader])
+            heads[head] = self._convolution(reader, read[reader])
+        if taps:
+            return _model([read[reader] for reader in self.readers], image)
+        outputs = [_heat_map(heads.pop("detector"))]
+        outputs += [ops.transpose(head, np.array([0, 2, 3, 1])) for head in heads.values()]  # cell by cell
+        return _model(outputs, image)
+
+    def _convolution(self, name: str, node: Any) -> Any:
+        layer = self._layers[name]
+        weight = ops.constant(layer.weight)
+        if self._ranges and name == "encoder.0":
+            node = ops.concat([node] * INT8_IMAGE_COPIES, axis=1)
+            weight = _quantised_weight(_spread(layer.weight))
+        elif self._ranges and (layer.convolution.kernel > 1 or name in INT8_LAST_LAYERS):
+            weight = _quantised_weight(layer.weight)
+        pad = layer.convolution.kernel // 2
+        node = ops.convolution(node, weight, [1, 1], [pad, pad], [pad, pad], [1, 1])
+        node = ops.add(node, _channels(layer.bias))
+        if layer.convolution.kernel == 1:
+            return node
+        node = ops.relu(node)
+        if layer.scale is not None and layer.shift is not None:
+            node = ops.add(ops.multiply(node, _channels(layer.scale)), _channels(layer.shift))
+        return node
+
+    def _quantised(self, reader: str, node: Any) -> Any:
+        if not self._ranges:
+            return node
+        low, high = ops.constant(np.float32(0)), ops.constant(np.float32(self._ranges[reader]))
+        return ops.fake_quantize(node, low, high, low, high, 256)  # unsigned: nothing is negative behind a ReLU
+
+
+def _quantised_weight(weight: Float32) -> Any:
+    """Signed and symmetric, with one step for each output channel."""
+    limit = np.abs(weight).max(axis=(1, 2, 3), keepdims=True)
+    low, high = ops.constant(-limit), ops.constant(limit)
+    return ops.fake_quantize(ops.constant(weight), low, high, low, high, 2 * INT8_MAX + 1)
+
+
+def _spread(weight: Float32) -> Float32:
+    """The first layer's weight (O, 1, 3, 3) as a sum over copies of the image (O, copies, 3, 3).
+
+    Eight bits are too few for the weights that read the image. Each is a whole number of steps four times finer, dealt
+    out to four copies; hardware adds products in fours anyway, so that they cost nothing.
+    """
+    limit = np.abs(weight).max(axis=(1, 2, 3), keepdims=True)
+    step = np.maximum(limit, 1e-30) / (INT8_MAX * INT8_IMAGE_COPIES)
+    whole, rest = np.divmod(np.rint(weight / step), INT8_IMAGE_COPIES)
+    parts = whole + (np.arange(INT8_IMAGE_COPIES)[:, None, None] < rest)
+    return np.asarray(parts * step, np.float32)
+
+
+def _heat_map(logits: Any) -> Any:
+    probabilities = ops.softmax(logits, 1)
+    first, last, step, axis = (ops.constant(np.array([value])) for value in (0, CELL * CELL, 1, 1))
+    return ops.depth_to_space(ops.slice(probabilities, first, last, step, axis), "blocks_first", CELL)
+
+
+def _channels(values: Float32) -> Any:
+    return ops.constant(values.reshape(1, -1, 1, 1))
+
+
+def _model(outputs: list[Any], image: Any) -> Any:
+    return ov.Model([ops.result(node) for node in outputs], [image])

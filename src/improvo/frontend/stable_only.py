@@ -1,0 +1,40 @@
+"""A frontend that keeps to itself what its stability head does not trust (paper, "Visualizing Stability")."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+from improvo.errors import ConfigError
+from improvo.frontend import Frontend
+from improvo.types import Features
+
+
+class StableOnly:
+    """Drops keypoints whose stability is below a threshold, before they are matched.
+
+    Weighing (w_ij) keeps a doubtful point for where there is nothing better; dropping it keeps its wrong matches out of
+    the start and out of RANSAC as well.
+
+    Args:
+        frontend: with a stability head.
+        least: probability in (0, 1].
+    """
+
+    def __init__(self, frontend: Frontend, least: float) -> None:
+        self.frontend, self.least = frontend, least
+        self.name = frontend.name
+
+    def __call__(self, image: NDArray[Any]) -> Features:
+        """Features of an image, best first.
+
+        Raises:
+            ConfigError: the frontend has no stability head.
+        """
+        features = self.frontend(image)
+        if features.stability is None:
+            raise ConfigError(
+                f"frontend {self.name}: has no stability head, so least_stability must be 0; superpoint-vo has one"
+            )
+        return features.take(features.stability >= self.least)

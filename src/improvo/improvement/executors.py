@@ -1,0 +1,146 @@
+"""Doing many independent jobs: one after another in this process, or in several local processes (Ray: `on_ray`)."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+from improvo.errors import ImprovoError
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+Tick = Callable[[], None]  # a job calls it as it goes on; raises KeyboardInterrupt when all is to stop
+
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+POLL_SECONDS = 0.2
+
+_worker_ticks: Any = None  # set in worker processes
+_worker_stop: Any = None
+
+
+class WorkerDiedError(ImprovoError):
+    """A worker process ended without an answer."""
+
+
+def run_here(
+    work: Callable[[Job, Tick], Result],
+    jobs: Sequence[Job],
+    on_result: Callable[[Job, Result | Exception], None],
+    on_ticks: Callable[[int], None],
+) -> None:
+    """One job after another; an exception of a job is its result, KeyboardInterrupt ends all."""
+    for job in jobs:
+        try:
+            result: Result | Exception = work(job, lambda: on_ticks(1))
+        except Exception as error:
+            result = error
+        on_result(job, result)
+
+
+def run_in_processes(
+    work: Callable[[Job, Tick], Result],
+    jobs: Sequence[Job],
+    on_result: Callable[[Job, Result | Exception], None],
+    on_ticks: Callable[[int], None],
+    workers: int,
+) -> None:
+    """As `run_here`, in `workers` fresh processes with one BLAS thread each; results come as they are ready.
+
+    A process that dies is a `WorkerDiedError` of the job that it had; another takes its place for the jobs that wait.
+
+    Args:
+        work: a function of a module, since it is sent to the workers by name; so are the jobs and results.
+    """
+    context = multiprocessing.get_context("spawn")
+    # No locks: a killed process would keep them. Each counter has one writer at a time.
+    stop = context.RawValue("b", 0)
+    counters = [context.RawValue("q", 0) for _ in range(min(workers, len(jobs)))]
+    waiting = deque(jobs)
+    running: dict[Future[Result], tuple[Job, int]] = {}
+    told = 0
+
+    def tell() -> None:
+        nonlocal told
+        count = sum(counter.value for counter in counters)
+        if count > told:
+            on_ticks(count - told)
+            told = count
+
+    with _one_blas_thread():
+        # A pool of one process per place, because a pool is lost as a whole when one of its processes dies.
+        pools = [ProcessPoolExecutor(1, context, _start_worker, (counter, stop)) for counter in counters]
+        try:
+            idle = list(range(len(pools)))
+            while waiting or running:
+                while waiting and idle:
+                    place, job = idle.pop(), waiting.popleft()
+                    running[pools[place].submit(_work, work, job)] = job, place
+                done, _ = wait(running, timeout=POLL_SECONDS, return_when=FIRST_COMPLETED)
+                tell()
+                for future in done:
+                    job, place = running.pop(future)
+                    result = _result(future)
+                    if isinstance(result, WorkerDiedError):
+                        pools[place].shutdown()
+                        pools[place] = ProcessPoolExecutor(1, context, _start_worker, (counters[place], stop))
+                    idle.append(place)
+                    on_result(job, result)
+            tell()
+        except BaseException:
+            stop.value = 1
+            raise
+        finally:
+            for pool in pools:
+                pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _result(future: Future[Any]) -> Any:
+    """The answer of a job, or the exception that it ended with."""
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        return WorkerDiedError("its worker process died (out of memory?); run again with fewer workers")
+    except Exception as error:
+        return error
+
+
+@contextmanager
+def _one_blas_thread() -> Iterator[None]:
+    """For the processes that start meanwhile: their libraries read it when they load."""
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _start_worker(ticks: Any, stop: Any) -> None:
+    """In a new worker: leave Ctrl-C to the parent, which passes it on through `stop`."""
+    import signal
+
+    import cv2
+
+    global _worker_ticks, _worker_stop
+    _worker_ticks, _worker_stop = ticks, stop
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    cv2.setNumThreads(1)
+
+
+def _work(work: Callable[[Job, Tick], Result], job: Job) -> Result:
+    def tick() -> None:
+        _worker_ticks.value += 1
+        if _worker_stop.value:
+            raise KeyboardInterrupt
+
+    return work(job, tick)

@@ -1,0 +1,222 @@
+"""The report of the loop: what was measured of every frontend, with pictures of the one at the start and the best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from improvo.errors import InputError
+from improvo.evaluation.unlabelled import spread_pairs
+from improvo.frontend.weights import load_weights
+from improvo.improvement.candidate import Candidate, training_losses
+from improvo.improvement.held_back import Part, Split
+from improvo.improvement.judgement import Judgement, rule
+from improvo.improvement.settings import ImproveSettings
+from improvo.improvement.telling import gain_words
+from improvo.labeling.store import DONE, read_records
+from improvo.report.improvement_page import Measure, Round, write_improvement_page
+from improvo.report.sheets import write_png
+from improvo.sequences import open_sequence
+
+_LOSSES = ("loss", "detector", "descriptor", "stability")
+_PANEL = 400  # pixels, width of each of the three panels of matches
+_SINGLE = 800
+
+
+def write_report(
+    path: Path,
+    candidates: Sequence[Candidate],
+    judgements: Sequence[Judgement],
+    best: int,
+    split: Split,
+    settings: ImproveSettings,
+) -> None:
+    """Write `report.html` of all rounds so far.
+
+    Args:
+        path: the HTML file.
+        candidates, judgements: of the start, then of every round.
+        best: which of them is kept.
+        split: what was held back.
+        settings: of the loop.
+    """
+    start = judgements[0]
+    rounds = [
+        _round(candidate, judgement, split, settings, pictures=number in (0, best))
+        for number, (candidate, judgement) in enumerate(zip(candidates, judgements, strict=True))
+    ]
+    names = ", ".join(one.name for one in split.training.paths[:3])
+    if len(split.training.paths) > 3:
+        names += f" and {len(split.training.paths) - 3} more"
+    write_improvement_page(
+        path,
+        "A frontend that teaches itself",
+        f"{Path(settings.frontend.name).name}, improved on {names}; judged on what it never saw, {split.words}.",
+        _measures(start, settings),
+        rounds,
+        _notes(candidates, judgements, split, settings),
+        best,
+        _verdict(candidates, judgements, best, settings),
+    )
+
+
+def _measures(start: Judgement, settings: ImproveSettings) -> list[Measure]:
+    gaps = start.gaps
+    keypoints, pixels = settings.judge.survival.max_keypoints, settings.judge.survival.max_epipolar_error
+    measures = [
+        Measure(
+            _score_name(start),
+            f"mutual nearest neighbours of {keypoints} keypoints that agree with one epipolar geometry of the known "
+            f"camera within {pixels:g} pixels, mean over the pairs of frames held back",
+            digits=1,
+        )
+    ]
+    if len(gaps) > 1:
+        measures += [Measure(f"matches that survive {gap} frames", "as above, of one gap", digits=1) for gap in gaps]
+    measures += [Measure(f"share of keypoints that survive {gap} frames", "as above, of all") for gap in gaps]
+    measures += [
+        Measure("frames tracked", "share of the frames held back that the odometry gave a pose to", digits=3),
+        Measure("track length", "mean number of frames of a connect-the-dots track", digits=2),
+        Measure("stable tracks", "share of the labelled tracks that are stable"),
+        Measure("re-projection error, pixels", "median over labelled tracks", larger_is_better=False, digits=3),
+    ]
+    for name in start.pose:
+        limit = "5 degrees" if name.startswith("rotation") else "5 cm"
+        measures.append(Measure(name, f"pose protocol, with depth: share of pairs with an error of less than {limit}"))
+    return measures
+
+
+def _score_name(judgement: Judgement) -> str:
+    one = len(judgement.gaps) == 1
+    return f"matches that survive {judgement.gaps[0]} frames" if one else "matches that survive, summed over the gaps"
+
+
+def _values(judgement: Judgement) -> dict[str, float]:
+    values = {_score_name(judgement): judgement.score}
+    for gap in judgement.gaps:
+        values[f"matches that survive {gap} frames"] = judgement.surviving(gap)
+        values[f"share of keypoints that survive {gap} frames"] = judgement.share[str(gap)]
+    values["frames tracked"] = judgement.tracked / max(judgement.frames, 1)
+    values["track length"] = judgement.track_length
+    values["stable tracks"] = judgement.stable_share
+    if judgement.error == judgement.error:
+        values["re-projection error, pixels"] = judgement.error
+    return {**values, **judgement.pose}
+
+
+def _round(
+    candidate: Candidate, judgement: Judgement, split: Split, settings: ImproveSettings, pictures: bool
+) -> Round:
+    losses = training_losses(candidate.training)
+    seconds = {"label what is held back": judgement.seconds["label"], "evaluate": judgement.seconds["evaluate"]}
+    labels: dict[str, int] = {}
+    if candidate.labels.is_dir():
+        records = [record for record in read_records(candidate.labels) if record.state == DONE]
+        labels = {name: sum(getattr(one, name) for one in records) for name in ("stable", "unstable", "ignore")}
+        seconds = {"label what is trained on": sum(record.seconds for record in records), **seconds}
+    trained = load_weights(candidate.weights).card.training if losses else {}
+    if "seconds" in trained:
+        seconds = {"train": float(trained["seconds"]), **seconds}
+    return Round(
+        candidate.name,
+        _values(judgement),
+        labels,
+        seconds,
+        _pictures(candidate, split, judgement, settings) if pictures else (),
+        {name: losses[name] for name in ("step", *_LOSSES) if name in losses},
+    )
+
+
+def _verdict(
+    candidates: Sequence[Candidate], judgements: Sequence[Judgement], best: int, settings: ImproveSettings
+) -> str:
+    words = rule(settings.judge)
+    if best:
+        gain = gain_words(judgements[best], judgements[0])
+        return f"{words} Kept: {candidates[best].name}; matches that survive against the start: {gain}."
+    if len(candidates) > 1:
+        return f"{words} No round was better than the start: the weights kept are those at the start, unchanged."
+    return words
+
+
+def _notes(
+    candidates: Sequence[Candidate], judgements: Sequence[Judgement], split: Split, settings: ImproveSettings
+) -> list[str]:
+    start, notes = judgements[0], list[str]()
+    if start.gaps != settings.judge.survival.gaps:
+        missing = " and ".join(str(gap) for gap in settings.judge.survival.gaps if gap not in start.gaps)
+        used = " and ".join(map(str, start.gaps))
+        notes.append(
+            f"What is held back is too short for pairs {missing} frames apart: judged by pairs {used} frames apart. "
+            "Short gaps are easy; judge by longer recordings before you believe a small gain."
+        )
+    notes += [f"Left out: {reason}" for reason in split.unusable]
+    for candidate, judgement in zip(candidates, judgements, strict=True):
+        notes += [f"{candidate.name}, no labels of {failure}" for failure in judgement.failures]
+        if candidate.labels.is_dir():
+            failed = [record for record in read_records(candidate.labels) if record.state != DONE]
+            notes += [f"{candidate.name}, not trained on {record.name}: {record.reason}" for record in failed]
+    return notes
+
+
+def _pictures(
+    candidate: Candidate, split: Split, judgement: Judgement, settings: ImproveSettings
+) -> tuple[tuple[Path, str], ...]:
+    """Matches of a pair held back, the labels that it makes there, and its stability; drawn once."""
+    pictures = []
+    for name, caption, draw in (
+        ("matches.png", "matches of two frames held back", _draw_matches),
+        ("labels.png", "labels of a frame held back", _draw_labels),
+        ("stability.png", "stability of a frame held back", _draw_stability),
+    ):
+        target = candidate.folder / "pictures" / name
+        if not target.is_file():
+            target.parent.mkdir(exist_ok=True)
+            try:
+                draw(target, candidate, split.held_back, judgement, settings)
+            except InputError:  # a frame that cannot be read, no stability head, no labels: no picture
+                continue
+        pictures.append((target, caption))
+    return tuple(pictures)
+
+
+def _draw_matches(
+    target: Path, candidate: Candidate, part: Part, judgement: Judgement, settings: ImproveSettings
+) -> None:
+    from improvo.frontend.registry import load_frontend
+    from improvo.report.match_picture import paint_matches
+
+    frontend = load_frontend(str(candidate.weights), settings.judge.survival.max_keypoints)
+    frontend.name = candidate.name
+    sequence = open_sequence(part.paths[0], part.sequence)
+    pairs = spread_pairs(len(sequence), judgement.gaps[0], settings.judge.survival.pairs)
+    if len(pairs) == 0:
+        raise InputError(f"{part.paths[0]}: too short for a pair")
+    a, b = (int(row) for row in pairs[len(pairs) // 2])
+    picture = paint_matches(frontend, sequence[a].image, sequence[b].image, None, sequence.camera, width=_PANEL)
+    write_png(target, picture)
+
+
+def _draw_stability(
+    target: Path, candidate: Candidate, part: Part, judgement: Judgement, settings: ImproveSettings
+) -> None:
+    from improvo.frontend.network import load_network_frontend
+    from improvo.report.stability_picture import paint_stability
+
+    frontend = load_network_frontend(candidate.weights, max_keypoints=settings.frontend.max_keypoints)
+    sequence = open_sequence(part.paths[0], part.sequence)
+    image = sequence[len(sequence) // 2].image
+    write_png(target, paint_stability(image, frontend, candidate.name, width=_SINGLE))
+
+
+def _draw_labels(
+    target: Path, candidate: Candidate, part: Part, judgement: Judgement, settings: ImproveSettings
+) -> None:
+    from improvo.report.run_folder import RunFolder
+    from improvo.report.track_pictures import TrackPictureSettings, paint_labels
+
+    done = [record for record in read_records(candidate.held_back) if record.state == DONE]
+    if not done:
+        raise InputError(f"{candidate.held_back}: has no labels")
+    run = RunFolder(candidate.held_back / done[0].name)
+    write_png(target, paint_labels(run, run.frames // 2, TrackPictureSettings(width=_SINGLE)))

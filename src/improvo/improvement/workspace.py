@@ -1,0 +1,123 @@
+"""The output folder of the loop: what is where, and that it is continued only as it was begun."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from improvo import config
+from improvo.errors import ConfigError, InputError
+from improvo.files import check_output_folder, make_output_folder, write_text
+from improvo.improvement.candidate import Candidate
+from improvo.improvement.settings import ImproveSettings
+
+COMMAND = "improve"
+# what may differ when a run is continued: none of these alters a result
+_FREE = {"training.optimiser": ("device", "threads", "workers", "checkpoint_minutes", "log_every")}
+
+
+class Workspace:
+    """OUT/
+        settings.yaml          what the result depends on; other settings are refused
+        split.json             which frames are trained on, and which held back
+        start/, round-1/ ...   a `Candidate` each
+        weights.safetensors    the best of them, with weights.json
+        report.html
+
+    Args:
+        folder: made if need be.
+        sequences, evaluate: as given by the user.
+        settings: of the loop.
+        start: weights file that it starts from.
+
+    Raises:
+        OutputError: the folder is not ours, or cannot be written.
+        ConfigError: it was begun with other settings, recordings or weights.
+    """
+
+    def __init__(
+        self, folder: Path, sequences: Sequence[Path], evaluate: Sequence[Path], settings: ImproveSettings, start: Path
+    ) -> None:
+        check_output_folder(folder, COMMAND)
+        self.folder = folder
+        values = _fixed(settings)
+        values["frontend"]["name"] = f"sha256:{hashlib.sha256(start.read_bytes()).hexdigest()}"
+        values["sequences"] = [str(path.resolve()) for path in sequences]
+        values["evaluate"] = [str(path.resolve()) for path in evaluate]
+        self._begin(values)
+
+    @property
+    def split(self) -> Path:
+        """What is trained on, and what held back."""
+        return self.folder / "split.json"
+
+    @property
+    def survey(self) -> Path:
+        """Label store of all sequences, only while it is being found out which of them can be labelled."""
+        return self.folder / "survey"
+
+    @property
+    def start(self) -> Candidate:
+        """The frontend before any improvement."""
+        return Candidate("start", self.folder / "start")
+
+    def round(self, number: int) -> Candidate:
+        """The frontend that a round has taught."""
+        return Candidate(f"round {number}", self.folder / f"round-{number}")
+
+    def rounds_judged(self) -> int:
+        """Rounds that are complete."""
+        number = 0
+        while self.round(number + 1).judgement.is_file():
+            number += 1
+        return number
+
+    @property
+    def weights(self) -> Path:
+        """The best weights."""
+        return self.folder / "weights.safetensors"
+
+    @property
+    def report(self) -> Path:
+        """What to look at."""
+        return self.folder / "report.html"
+
+    def _begin(self, values: dict[str, Any]) -> None:
+        path = self.folder / "settings.yaml"
+        if path.is_file():
+            try:
+                before = yaml.safe_load(path.read_text())
+            except yaml.YAMLError:
+                raise InputError(f"{path}: is damaged; choose another output folder") from None
+            difference = config.first_difference(before, values)
+            if difference and not self.split.is_file():  # nothing has come of it yet
+                for folder in (self.survey, self.start.folder):
+                    shutil.rmtree(folder, ignore_errors=True)
+            elif difference:
+                raise ConfigError(
+                    f"{self.folder}: was begun with {difference}; give the same again, or another output folder"
+                )
+        make_output_folder(self.folder, COMMAND)
+        write_text(path, yaml.safe_dump(values, sort_keys=False))
+        for leftover in list(self.folder.rglob(".*.partial*")):  # of a killed run; some lie in others
+            if leftover.is_dir():
+                shutil.rmtree(leftover, ignore_errors=True)
+            else:
+                leftover.unlink(missing_ok=True)
+
+
+def _fixed(settings: ImproveSettings) -> dict[str, Any]:
+    """The settings that the result depends on."""
+    values = config.to_dict(settings)
+    for section, names in _FREE.items():
+        target = values
+        for name in section.split("."):
+            target = target[name]
+        for name in names:
+            target.pop(name)
+    return values

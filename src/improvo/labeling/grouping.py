@@ -1,0 +1,29 @@
+"""Rows and medians by group: what tables of tracks and observations are asked for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from improvo.types import Float64, Int64
+
+
+def rows_of(ids: Int64, wanted: Int64) -> Int64:
+    """The row of `ids` (unique) that holds each wanted id."""
+    order = np.argsort(ids, kind="stable")
+    return order[np.searchsorted(ids, wanted, sorter=order)] if len(ids) else np.zeros(0, np.int64)
+
+
+def medians(group: Int64, values: NDArray[Any], groups: int) -> Float64:
+    """Median (groups,) of the finite values (M,) of each group 0..groups-1, NaN for one without any."""
+    known = np.isfinite(values)
+    order = np.lexsort((values[known], group[known]))
+    ordered, group = values[known][order].astype(np.float64), group[known][order]
+    start, end = (np.searchsorted(group, np.arange(groups), side=side) for side in ("left", "right"))
+    some = end > start
+    low, high = (start + (end - start - 1) // 2)[some], (start + (end - start) // 2)[some]
+    result = np.full(groups, np.nan)
+    result[some] = 0.5 * (ordered[low] + ordered[high])
+    return result

@@ -1,0 +1,113 @@
+"""Reading a label store: what training and reports are given."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from improvo import config
+from improvo.errors import InputError
+from improvo.geometry.camera import Camera
+from improvo.geometry.se3 import inverse
+from improvo.labeling.frames import FRAMES_FILE, FramesTable, PackedImages, read_frames
+from improvo.labeling.settings import LabelSettings
+from improvo.labeling.store import DONE, SETTINGS_FILE, SequenceRecord, read_records
+from improvo.labeling.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
+from improvo.sequences.base import SequenceSettings
+from improvo.types import Float64, UInt8
+
+RUN_FILE, TRAJECTORY_FILE = "run.json", "trajectory.txt"
+
+
+@dataclass(frozen=True)
+class LabelledSequence:
+    """One finished sequence of a store; tables are read when they are first asked for."""
+
+    folder: Path
+    record: SequenceRecord
+    settings: SequenceSettings  # how its recording was read
+    rule: LabelSettings  # what the labels were made by
+
+    @property
+    def name(self) -> str:
+        """Its folder in the store."""
+        return self.record.name
+
+    @cached_property
+    def tracks(self) -> TracksTable:
+        """One row per observation."""
+        return read_tracks(self.folder / TRACKS_FILE)
+
+    @cached_property
+    def points(self) -> PointsTable:
+        """One row per track, with its label."""
+        return read_points(self.folder / POINTS_FILE)
+
+    @cached_property
+    def frames(self) -> FramesTable:
+        """One row per processed frame."""
+        return read_frames(self.folder / FRAMES_FILE)
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The pinhole camera of the processed frames."""
+        try:
+            return Camera(**json.loads((self.folder / RUN_FILE).read_text())["camera"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{self.folder / RUN_FILE}: cannot be read ({error}); label it again") from None
+
+    @cached_property
+    def cam_from_world(self) -> Float64:
+        """(F, 4, 4) final poses by frame, NaN where there is none; a segment has its own world."""
+        from improvo.sequences import read_trajectory
+
+        posed = self.frames.segment >= 0
+        trajectory = read_trajectory(self.folder / TRAJECTORY_FILE)
+        if len(trajectory) != posed.sum():
+            raise InputError(f"{self.folder}: {TRAJECTORY_FILE} and {FRAMES_FILE} disagree; label it again")
+        poses = np.full((len(posed), 4, 4), np.nan)
+        poses[posed] = inverse(trajectory.world_from_cam)
+        return poses
+
+    def image(self, frame: int) -> UInt8:
+        """The grey image (H, W) at a position of the processed sequence, packed or from the recording.
+
+        Raises:
+            InputError: neither is there.
+        """
+        return self._images(frame)
+
+    @cached_property
+    def _images(self) -> Callable[[int], UInt8]:
+        if self.record.packed:
+            return PackedImages(self.folder).__getitem__
+        from improvo.sequences import open_sequence
+
+        sequence = open_sequence(self.record.path, self.settings)
+        rows = np.searchsorted(sequence.indices, self.frames.index)
+        return lambda frame: sequence[int(rows[frame])].image
+
+
+def read_labels(folder: Path) -> list[LabelledSequence]:
+    """All finished sequences of a store, by name.
+
+    Raises:
+        InputError: no store, or one without any finished sequence.
+    """
+    records = read_records(folder)
+    try:
+        values = yaml.safe_load((folder / SETTINGS_FILE).read_text())
+        settings = config.from_dict(SequenceSettings, values["sequence"], where=str(folder / SETTINGS_FILE))
+        rule = config.from_dict(LabelSettings, values["labels"], where=str(folder / SETTINGS_FILE))
+    except (OSError, yaml.YAMLError, KeyError, TypeError):
+        raise InputError(f"{folder}: is no label store; `improvo label SEQUENCE... -o {folder}` makes one") from None
+    done = [record for record in records if record.state == DONE]
+    if not done:
+        raise InputError(f"{folder}: has no labelled sequence; see the reasons with `improvo label`, and run it again")
+    return [LabelledSequence(folder / record.name, record, settings, rule) for record in done]

@@ -1,0 +1,183 @@
+"""The label store: one folder per sequence, a manifest of all, nothing half-written, never one file per image.
+
+    LABELS/
+        manifest.parquet        one row per sequence: what it is, whether it is done, and if not, why
+        settings.yaml           what the labels were made with; other settings are refused
+        NAME/                   appears, complete, when the sequence is done
+            tracks.parquet, points.parquet, trajectory.txt, map.ply, run.json
+            frames.parquet      position, index in the recording, time, segment, trusted
+            images-00000.parquet ...   with --pack: the frames themselves
+            label.json          this sequence's row of the manifest
+
+A sequence in work lives in `.NAME.partial`; what a killed run leaves there is cleared away by the next one. The
+manifest is made from the folders, so it can be lost without harm.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from improvo.config import first_difference
+from improvo.errors import ConfigError, InputError, OutputError
+from improvo.files import check_output_folder, make_output_folder, write_json, write_text, written_atomically
+
+MANIFEST_FILE, SETTINGS_FILE, RECORD_FILE = "manifest.parquet", "settings.yaml", "label.json"
+DONE, FAILED = "done", "failed"
+_COMMAND = "label"
+
+
+@dataclass(frozen=True)
+class SequenceRecord:
+    """One row of the manifest."""
+
+    name: str  # folder in the store
+    path: str  # of the recording, absolute
+    state: str  # DONE or FAILED
+    reason: str = ""  # why it failed
+    notes: str = ""  # what of it has no labels, and why
+    format: str = ""
+    frames: int = 0  # processed
+    tracked: int = 0  # with a pose
+    trusted: int = 0  # of those, by the second opinion
+    segments: int = 0
+    tracks: int = 0
+    stable: int = 0
+    unstable: int = 0
+    ignore: int = 0
+    withheld: int = 0  # labels that the second opinion took away
+    packed: bool = False
+    seconds: float = 0.0
+
+
+class LabelStore:
+    """A folder of labels that is written to.
+
+    Args:
+        folder: made if need be.
+        settings: everything that the labels depend on, as plain dictionaries.
+        relabel: where the folder was made with other settings, clear it instead of refusing.
+
+    Raises:
+        OutputError: the folder is not ours or cannot be written.
+        ConfigError: it was made with other settings.
+    """
+
+    def __init__(self, folder: Path, settings: dict[str, Any], relabel: bool = False) -> None:
+        check_output_folder(folder, _COMMAND)
+        self.folder = folder
+        text = yaml.safe_dump(settings, sort_keys=False)
+        before = folder / SETTINGS_FILE
+        if before.is_file() and before.read_text() != text:
+            if not relabel:
+                changed = first_difference(yaml.safe_load(before.read_text()), settings)
+                raise ConfigError(f"{folder}: its labels were made with {changed}; use another folder, or --relabel")
+            for record in self.records():
+                if record.state == DONE:
+                    (folder / record.name).rename(self.partial(record.name))  # never a sequence that is half there
+                else:
+                    self._failure(record.name).unlink(missing_ok=True)
+        make_output_folder(folder, _COMMAND)
+        for leftover in folder.glob(".*.partial*"):
+            if leftover.is_dir():
+                shutil.rmtree(leftover, ignore_errors=True)
+            else:
+                leftover.unlink(missing_ok=True)
+        write_text(before, text)
+
+    def records(self) -> list[SequenceRecord]:
+        """All sequences that are done or have failed, by name."""
+        return read_records(self.folder)
+
+    def is_done(self, name: str) -> bool:
+        """Whether the sequence has labels."""
+        return (self.folder / name / RECORD_FILE).is_file()
+
+    def partial(self, name: str) -> Path:
+        """The folder to label the sequence in, empty; it does not exist yet."""
+        folder = self.folder / f".{name}.partial"
+        shutil.rmtree(folder, ignore_errors=True)
+        return folder
+
+    def finish(self, record: SequenceRecord) -> None:
+        """The sequence in its partial folder is complete: show it."""
+        partial, final = self.folder / f".{record.name}.partial", self.folder / record.name
+        write_json(partial / RECORD_FILE, asdict(record))
+        try:
+            partial.rename(final)
+        except OSError as error:
+            raise OutputError(f"{final}: cannot be put in place ({error.strerror}); remove what is there") from None
+        self._failure(record.name).unlink(missing_ok=True)
+        self._refresh_manifest()
+
+    def fail(self, record: SequenceRecord) -> None:
+        """The sequence cannot be labelled: keep the reason, drop the rest. The next run tries again."""
+        shutil.rmtree(self.folder / f".{record.name}.partial", ignore_errors=True)
+        write_json(self._failure(record.name), asdict(record))
+        self._refresh_manifest()
+
+    def write_manifest(self) -> None:
+        """`manifest.parquet` from what is there."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        types = {"str": pa.string(), "int": pa.int64(), "float": pa.float64(), "bool": pa.bool_()}
+        schema = pa.schema([(field.name, types[str(field.type)]) for field in dataclasses.fields(SequenceRecord)])
+        table = pa.Table.from_pylist([asdict(record) for record in self.records()], schema)
+        with written_atomically(self.folder / MANIFEST_FILE) as temporary:
+            pq.write_table(table, temporary)
+
+    def _refresh_manifest(self) -> None:
+        """On the way: the folders are what counts, so a full disk is no failure of this sequence."""
+        with suppress(OutputError):
+            self.write_manifest()
+
+    def _failure(self, name: str) -> Path:
+        return self.folder / f".{name}.failed.json"
+
+
+def read_records(folder: Path) -> list[SequenceRecord]:
+    """The records of a store, by name.
+
+    Raises:
+        InputError: no such folder, or a record that cannot be read.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; `improvo label` makes it")
+    files = [*folder.glob(f"*/{RECORD_FILE}"), *folder.glob(".*.failed.json")]
+    records: dict[str, SequenceRecord] = {}
+    for file in files:
+        if file.parent.name.endswith(".partial"):
+            continue
+        try:
+            record = SequenceRecord(**json.loads(file.read_text()))
+        except (OSError, ValueError, TypeError):
+            raise InputError(f"{file}: is damaged; remove it and run `improvo label` again") from None
+        records.setdefault(record.name, record)  # labels come before an older failure of the same sequence
+    return sorted(records.values(), key=lambda record: record.name)
+
+
+def sequence_names(paths: list[Path]) -> dict[str, Path]:
+    """A folder name for each recording, from its own; the same list gives the same names.
+
+    Raises:
+        InputError: a recording is named twice.
+    """
+    names: dict[str, Path] = {}
+    for path in paths:
+        resolved = path.resolve()
+        if resolved in names.values():
+            raise InputError(f"{path}: is given twice")
+        stem = (resolved.stem if resolved.is_file() else resolved.name).lstrip(".") or "sequence"
+        name, number = stem, 2
+        while name in names:
+            name, number = f"{resolved.parent.name}-{stem}" if number == 2 else f"{stem}-{number}", number + 1
+        names[name] = resolved
+    return names

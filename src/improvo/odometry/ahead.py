@@ -1,0 +1,55 @@
+"""Reading, detecting and matching ahead of the backend, in a second thread, so that two cores are used."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+from improvo.odometry.visual_odometry import MatchedFeatures
+from improvo.types import Features, Frame, UInt8
+
+_AHEAD = 2  # frames; more would only cost memory
+
+
+@dataclass(frozen=True)
+class DetectedFrame:
+    """A frame with its matched features, and the seconds that they took."""
+
+    frame: Frame
+    matched: MatchedFeatures
+    reading: float  # seconds
+    detecting: float  # seconds
+    matching: float  # seconds
+
+
+def detected_ahead(
+    frames: Iterable[Frame], detect: Callable[[UInt8], Features], match: Callable[[Features], MatchedFeatures]
+) -> Iterator[DetectedFrame]:
+    """The frames in order with their features and matches, computed ahead by one worker thread.
+
+    An error of a frame is raised when its turn comes, so that everything before it is processed.
+    """
+    iterator = iter(frames)
+
+    def next_frame() -> DetectedFrame | None:
+        start = time.perf_counter()
+        frame = next(iterator, None)
+        if frame is None:
+            return None
+        read = time.perf_counter()
+        features = detect(frame.image)
+        detected = time.perf_counter()
+        matched = match(features)
+        return DetectedFrame(frame, matched, read - start, detected - read, time.perf_counter() - detected)
+
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="detect") as worker:
+        waiting: list[Future[DetectedFrame | None]] = [worker.submit(next_frame) for _ in range(_AHEAD)]
+        try:
+            while (detected := waiting.pop(0).result()) is not None:
+                waiting.append(worker.submit(next_frame))
+                yield detected
+        finally:
+            for future in waiting:
+                future.cancel()

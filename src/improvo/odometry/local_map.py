@@ -1,0 +1,182 @@
+"""The map around the camera: pose of a new view, lost points found again, new points triangulated."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+import numpy as np
+import poselib
+
+from improvo.backend.triangulation import triangulate_tracks
+from improvo.geometry import se3
+from improvo.geometry.camera import Camera
+from improvo.odometry.refind import match_by_projection
+from improvo.odometry.settings import OdometrySettings
+from improvo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_points, trusted
+from improvo.tracking.matching import match_units
+from improvo.types import Float32, Float64, Int64
+
+
+class LocalMap:
+    """Points and the views that saw them last.
+
+    Args:
+        camera: pinhole camera of the frames.
+        settings: of the odometry.
+        descriptor_distance: the matching threshold on unit descriptors of this frontend.
+    """
+
+    def __init__(self, camera: Camera, settings: OdometrySettings, descriptor_distance: float) -> None:
+        self.camera = camera
+        self.store = PointStore()
+        self.history: deque[View] = deque(maxlen=settings.matching.refind_frames)  # in order of processing
+        self._settings = settings
+        self._descriptor_distance = descriptor_distance
+        self._refind_radius = max(3.0, settings.matching.refind_radius * camera.width / 640.0)
+
+    def remember(self, view: View) -> None:
+        """The view is processed: its points were seen last in it."""
+        self.store.last_seen[view.points[view.observed]] = view.position
+        self.history.append(view)
+
+    def localise(self, view: View, neighbour: View) -> tuple[int, float]:
+        """Pose of `view` from the map points that its tracks share with `neighbour` (PnP, then lost points again).
+
+        Returns:
+            Number of inliers, and their share of the 3D-to-2D matches tried; (0, 0) leaves the view without a pose.
+        """
+        inherit_points(view, neighbour)
+        inliers, share = self._solve_pose(view)
+        if self._is_lost(inliers, share):
+            for earlier in reversed(self.history):
+                self._match_with(view, earlier)
+                inliers, share = self._solve_pose(view)
+                if not self._is_lost(inliers, share):
+                    break
+            else:
+                view.cam_from_world = None
+                view.points[:] = NO_POINT
+                return inliers, share
+        self._find_lost_points(view)
+        return inliers, share
+
+    def _is_lost(self, inliers: int, share: float) -> bool:
+        loss = self._settings.loss
+        return inliers < loss.min_inliers or share < loss.min_inlier_share
+
+    def _match_with(self, view: View, earlier: View) -> None:
+        """3D-to-2D matches of a view by descriptors alone, against the map points of one earlier view."""
+        view.points[:] = NO_POINT
+        rows = earlier.observed
+        matches = match_units(earlier.descriptors[rows], view.descriptors, self._descriptor_distance)
+        view.points[matches[:, 1]] = earlier.points[rows[matches[:, 0]]]
+
+    def _solve_pose(self, view: View) -> tuple[int, float]:
+        """RANSAC PnP on the trusted points; whatever does not fit the pose loses its point."""
+        rows = view.observed
+        if len(rows) < 4:
+            return 0, 0.0
+        max_error = self._settings.window.max_error
+        used = trusted(view.weights[rows], self._settings.trust)
+        pose, report = poselib.estimate_absolute_pose(
+            view.keypoints[rows[used]],
+            self.store.xyz[view.points[rows[used]]],
+            poselib_camera(self.camera),
+            {
+                "max_reproj_error": max_error,
+                "min_iterations": 100,
+                "max_iterations": 2000,
+                "seed": self._settings.seed,
+            },
+        )
+        inliers = np.asarray(report["inliers"], bool)
+        view.cam_from_world = se3.rigid(pose.R, pose.t)
+        fits = np.zeros(len(rows), bool)
+        fits[used] = inliers
+        if not used.all():
+            doubtful = rows[~used]
+            pixels, visible = self.project(view.cam_from_world, self.store.xyz[view.points[doubtful]])
+            fits[~used] = visible & (np.linalg.norm(pixels - view.keypoints[doubtful], axis=1) <= max_error)
+        view.points[rows[~fits]] = NO_POINT
+        return int(inliers.sum()), float(inliers.mean())
+
+    def _find_lost_points(self, view: View) -> None:
+        """Points of the last frames that should be visible take a free keypoint near their projection."""
+        assert view.cam_from_world is not None
+        ids, descriptors = self._lost_points(view)
+        projections, inside = self.project(view.cam_from_world, self.store.xyz[ids])
+        free = np.flatnonzero(view.points < 0)
+        pairs = match_by_projection(
+            projections[inside],
+            descriptors[inside],
+            view.keypoints[free],
+            view.descriptors[free],
+            self._refind_radius,
+            self._descriptor_distance,
+        )
+        view.points[free[pairs[:, 1]]] = ids[inside][pairs[:, 0]]
+
+    def _lost_points(self, view: View) -> tuple[Int64, Float32]:
+        """Ids (L,) of recently seen points that `view` does not observe, with their last descriptors (L, D)."""
+        ids, descriptors = [np.zeros(0, np.int64)], [view.descriptors[:0]]
+        last_seen = self.store.last_seen
+        seen_now = np.zeros(self.store.count, bool)
+        seen_now[view.points[view.observed]] = True
+        for earlier in self.history:
+            rows = earlier.observed
+            points = earlier.points[rows]
+            lost = (last_seen[points] == earlier.position) & ~seen_now[points]
+            ids.append(points[lost])
+            descriptors.append(earlier.descriptors[rows[lost]])
+        return np.concatenate(ids), np.concatenate(descriptors)
+
+    def project(self, cam_from_world: Float64, xyz: Float64) -> tuple[Float64, Mask]:
+        """Pixels (N, 2) of world points (N, 3), and whether they are in front of the camera and inside the image."""
+        points_cam = se3.transform(cam_from_world, xyz)
+        in_front = points_cam[:, 2] > 1e-6
+        points_cam[~in_front, 2] = 1.0
+        pixels = self.camera.project(points_cam)
+        inside = (pixels >= -0.5).all(axis=1) & (pixels <= (self.camera.width - 0.5, self.camera.height - 0.5)).all(1)
+        return pixels, in_front & inside
+
+    def triangulate(self, view: View, others: Iterable[View]) -> int:
+        """New points from the view's tracks that have no point yet, over `others`; returns how many."""
+        tracks = view.tracks[view.points < 0]
+        views = [view, *others]
+        seen = [(v, np.flatnonzero(np.isin(v.tracks, tracks) & (v.points < 0))) for v in views]
+        track = np.concatenate([v.tracks[rows] for v, rows in seen])
+        camera = np.concatenate([np.full(len(rows), i) for i, (_, rows) in enumerate(seen)])
+        row = np.concatenate([rows for _, rows in seen])
+        order = np.lexsort((camera, track))
+        track, camera, row = track[order], camera[order], row[order]
+        keypoints = np.concatenate([v.keypoints[rows] for v, rows in seen])[order]
+        _, offsets = np.unique(track, return_index=True)
+        offsets = np.append(offsets, len(track)).astype(np.int64)
+        poses = np.stack([v.cam_from_world for v in views if v.cam_from_world is not None])
+        result = triangulate_tracks(keypoints, camera.astype(np.int64), offsets, poses, self.camera.K)
+        counts = np.diff(offsets)
+        worst = np.maximum.reduceat(result.errors, offsets[:-1]) if len(track) else np.zeros(0)
+        good = (
+            result.in_front
+            & (counts >= 2)
+            & (result.parallax_deg >= self._settings.start.min_parallax_deg)
+            & (worst <= self._settings.window.max_error)
+        )
+        ids = np.full(len(counts), NO_POINT)
+        ids[good] = self.store.add(result.points[good], view.position)
+        point = np.repeat(ids, counts)
+        for i, v in enumerate(views):
+            of_view = (camera == i) & (point >= 0)
+            v.points[row[of_view]] = point[of_view]
+        return int(good.sum())
+
+
+def poselib_camera(camera: Camera) -> dict[str, object]:
+    """The camera as PoseLib wants it."""
+    return {
+        "model": "PINHOLE",
+        "width": camera.width,
+        "height": camera.height,
+        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
+    }

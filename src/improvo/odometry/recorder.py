@@ -1,0 +1,149 @@
+"""Streams finished tracks with their labels to disk while the odometry runs, so that memory stays bounded."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from improvo.geometry import se3
+from improvo.geometry.camera import Camera
+from improvo.labeling.settings import LabelSettings
+from improvo.labeling.stability import label_stability
+from improvo.labeling.tables import POINTS_FILE, TRACKS_FILE, PointsWriter, TracksWriter
+from improvo.odometry.journal import FinalView
+from improvo.types import Float64, Int64, Tracks
+
+_FLUSH_EVERY = 200  # final frames
+
+
+class TrackRecorder:
+    """Writes `tracks.parquet` and `points.parquet` of raw connect-the-dots tracks, with every link they had.
+
+    A track is written when it has ended and all frames that it passed are final. Use as a context manager: without an
+    error, the files appear when the block ends.
+    """
+
+    def __init__(self, folder: Path, camera: Camera, settings: LabelSettings) -> None:
+        self._camera = camera
+        self._settings = settings
+        self._tracks_writer = TracksWriter(folder / TRACKS_FILE)
+        self._points_writer = PointsWriter(folder / POINTS_FILE)
+        self._pending: dict[int, FinalView] = {}  # final frames with tracks that are not written yet
+        self._rest: _Rows | None = None  # rows of unfinished tracks from frames before those
+        self._next_position = 0  # all frames before it are final
+        self._poses: dict[int, tuple[Float64, int]] = {}  # of frames that unfinished tracks may refer to
+        self.counts: Counter[str] = Counter()
+
+    def __enter__(self) -> TrackRecorder:
+        self._tracks_writer.__enter__()
+        try:
+            self._points_writer.__enter__()
+        except BaseException as error:
+            self._tracks_writer.__exit__(type(error), error, error.__traceback__)
+            raise
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        try:
+            if error[0] is None:
+                self._flush(everything=True)
+        except BaseException as failure:
+            error = (type(failure), failure, failure.__traceback__)
+            raise
+        finally:
+            self._points_writer.__exit__(*error)  # type: ignore[arg-type]
+            self._tracks_writer.__exit__(*error)  # type: ignore[arg-type]
+
+    def add(self, view: FinalView) -> None:
+        """A frame became final (in any order)."""
+        self._pending[view.position] = view
+        if len(self._pending) >= _FLUSH_EVERY:
+            self._flush()
+
+    def _flush(self, everything: bool = False) -> None:
+        """Write the tracks that ended in frames all of whose neighbours are final."""
+        while self._next_position in self._pending or (everything and self._pending):
+            view = self._pending.pop(self._next_position, None)
+            if view is not None:
+                self._take(view)
+            self._next_position += 1
+        if self._rest is None or len(self._rest.frame) == 0:
+            return
+        rows = self._rest.sorted()
+        last_frame = np.maximum.reduceat(rows.frame, rows.starts)
+        # a chain has no gaps, so one that misses the newest final frame is over
+        over = np.ones(len(last_frame), bool) if everything else last_frame < self._next_position - 1
+        finished = np.repeat(over, rows.lengths)
+        self._write(rows.take(finished))
+        self._rest = rows.take(~finished)
+        oldest = int(self._rest.frame.min()) if len(self._rest.frame) else self._next_position
+        self._poses = {position: pose for position, pose in self._poses.items() if position >= oldest}
+
+    def _take(self, view: FinalView) -> None:
+        pose = se3.inverse(view.world_from_cam) if view.segment >= 0 else np.full((4, 4), np.nan)
+        self._poses[view.position] = (pose, view.segment)
+        frame = np.full(len(view.tracks), view.position)
+        new = _Rows(frame, view.tracks, view.keypoints, view.weights, view.points)
+        self._rest = new if self._rest is None else self._rest.followed_by(new)
+
+    def _write(self, rows: _Rows) -> None:
+        if len(rows.frame) == 0:
+            return
+        first = int(rows.frame.min())
+        count = int(rows.frame.max()) + 1 - first
+        cam_from_world = np.full((count, 4, 4), np.nan)
+        segment = np.full(count, -1)
+        for position, (pose, number) in self._poses.items():
+            if 0 <= position - first < count:
+                cam_from_world[position - first], segment[position - first] = pose, number
+        tracks = Tracks(
+            rows.frame - first, rows.track, rows.keypoints.astype(np.float32), rows.weight.astype(np.float32)
+        )
+        labels = label_stability(
+            tracks, cam_from_world, segment, self._camera.K, self._settings, point=rows.last_points()
+        )
+        self._tracks_writer.write(rows.frame, rows.track, tracks.keypoints, tracks.weight, labels.errors)
+        self._points_writer.write(labels)
+        self.counts.update(labels.counts())
+        self.counts["tracks"] += len(labels)
+        self.counts["observations"] += len(tracks)
+
+
+class _Rows:
+    """Observations as columns."""
+
+    def __init__(self, frame: Int64, track: Int64, keypoints: Float64, weight: Float64, point: Int64) -> None:
+        self.frame, self.track, self.keypoints, self.weight, self.point = frame, track, keypoints, weight, point
+
+    @property
+    def _columns(self) -> tuple[np.ndarray, ...]:
+        return self.frame, self.track, self.keypoints, self.weight, self.point
+
+    def take(self, rows: np.ndarray) -> _Rows:
+        return _Rows(*(column[rows] for column in self._columns))
+
+    def followed_by(self, other: _Rows) -> _Rows:
+        return _Rows(*(np.concatenate(pair) for pair in zip(self._columns, other._columns, strict=True)))
+
+    def sorted(self) -> _Rows:
+        """By track, then frame."""
+        return self.take(np.lexsort((self.frame, self.track)))
+
+    @property
+    def starts(self) -> Int64:
+        """First row of each track; the rows are sorted."""
+        return np.flatnonzero(np.diff(self.track, prepend=-1))
+
+    @property
+    def lengths(self) -> Int64:
+        return np.diff(np.append(self.starts, len(self.track)))
+
+    def last_points(self) -> Int64:
+        """The map point that owns each track: the last one it observed, -1 for none."""
+        rows = np.flatnonzero(self.point >= 0)
+        index = np.repeat(np.arange(len(self.starts)), self.lengths)
+        owner = np.full(len(self.starts), -1)
+        owner[index[rows]] = self.point[rows]
+        return owner

@@ -1,0 +1,204 @@
+"""One sequence from frames to files: what `improvo run` does."""
+
+from __future__ import annotations
+
+import platform
+import signal
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from threading import current_thread, main_thread
+from typing import Any
+
+import numpy as np
+
+from improvo import __version__
+from improvo.config import to_dict
+from improvo.errors import InputError
+from improvo.files import make_output_folder, write_json
+from improvo.frontend import Frontend
+from improvo.frontend.registry import load_odometry_frontend
+from improvo.odometry.ahead import detected_ahead
+from improvo.odometry.ply import write_ply
+from improvo.odometry.recorder import TrackRecorder
+from improvo.odometry.run_settings import RunSettings
+from improvo.odometry.view import View
+from improvo.odometry.viewer import NullViewer, Viewer
+from improvo.odometry.visual_odometry import VisualOdometry
+from improvo.sequences import Sequence, write_trajectory
+from improvo.types import Trajectory
+
+_MIN_FRAMES = 3
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """What a run found; `report` is the content of run.json."""
+
+    folder: Path
+    trajectory: Trajectory
+    report: dict[str, Any]
+
+    @property
+    def tracked(self) -> int:
+        """Frames with a pose."""
+        return int(self.trajectory.valid.sum())
+
+
+def run_odometry(
+    sequence: Sequence,
+    folder: Path,
+    settings: RunSettings,
+    command: str = "run",
+    frontend: Frontend | None = None,
+    viewer: Viewer | None = None,
+    progress: Callable[[View], None] | None = None,
+) -> RunSummary:
+    """Track a sequence and write its trajectory, map, tracks and report into `folder`.
+
+    An interrupt (KeyboardInterrupt) ends the sequence there: what was tracked is written as a valid result.
+
+    Args:
+        sequence: the frames.
+        folder: made if need be; must be empty or one that `command` made.
+        settings: all of them; `settings.sequence` is only recorded.
+        frontend: in place of the one that the settings name.
+        viewer: is shown every frame.
+        progress: is called after every frame.
+
+    Raises:
+        InputError: fewer than three readable frames.
+        OutputError: the folder cannot be used.
+    """
+    frontend = frontend or load_odometry_frontend(
+        settings.frontend.name, settings.frontend.max_keypoints, settings.frontend.least_stability
+    )
+    viewer = viewer or NullViewer()
+    if sequence.length is not None and sequence.length < _MIN_FRAMES:
+        raise InputError(f"{sequence.path}: has {sequence.length} frames; odometry needs at least {_MIN_FRAMES}")
+    make_output_folder(folder, command)
+    seconds: defaultdict[str, float] = defaultdict(float)
+    started = time.perf_counter()
+    with TrackRecorder(folder, sequence.camera, settings.labels) as recorder:
+        odometry = VisualOdometry(
+            frontend, sequence.camera, settings.odometry, settings.frontend.use_stability, on_final=recorder.add
+        )
+        viewer.begin(sequence.camera)
+        processed, interrupted = _track_all(sequence, frontend, odometry, viewer, progress, seconds)
+        odometry.finish()
+        viewer.end()
+        if len(processed) < _MIN_FRAMES and not interrupted:
+            raise InputError(f"{sequence.path}: only {len(processed)} of its frames can be read; check the recording")
+    trajectory = odometry.trajectory
+    write_trajectory(folder / "trajectory.txt", trajectory)
+    write_ply(folder / "map.ply", odometry.map)
+    seconds["total"] = time.perf_counter() - started
+    report = _report(sequence, settings, frontend, odometry, processed, interrupted, recorder.counts, seconds)
+    write_json(folder / "run.json", report)
+    return RunSummary(folder, trajectory, report)
+
+
+def _track_all(
+    sequence: Sequence,
+    frontend: Frontend,
+    odometry: VisualOdometry,
+    viewer: Viewer,
+    progress: Callable[[View], None] | None,
+    seconds: defaultdict[str, float],
+) -> tuple[list[int], bool]:
+    """All frames in order; returns the recording's index of each processed one, and whether it was interrupted."""
+    processed: list[int] = []
+    try:
+        for detected in detected_ahead(sequence, frontend, odometry.match):
+            with _interrupts_wait():
+                start = time.perf_counter()
+                view = odometry.track_matched(detected.matched, detected.frame.time)
+                seconds["track and adjust"] += time.perf_counter() - start
+                seconds["read"] += detected.reading
+                seconds["detect"] += detected.detecting
+                seconds["match"] += detected.matching
+                processed.append(detected.frame.index)
+                viewer.show(detected.frame, view, odometry.running_points)
+                if progress is not None:
+                    progress(view)
+    except KeyboardInterrupt:
+        return processed, True
+    return processed, False
+
+
+@contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """Ctrl-C takes effect at the end: compiled code would make a SystemError of it, and half a frame would be left."""
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler or current_thread() is not main_thread():
+        yield
+        return
+    came: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if came:
+        raise KeyboardInterrupt
+
+
+def _report(
+    sequence: Sequence,
+    settings: RunSettings,
+    frontend: Frontend,
+    odometry: VisualOdometry,
+    processed: list[int],
+    interrupted: bool,
+    tracks: Counter[str],
+    seconds: defaultdict[str, float],
+) -> dict[str, Any]:
+    """The content of run.json."""
+    trajectory = odometry.trajectory
+    has_pose = trajectory.valid
+    camera = sequence.camera
+    return {
+        "input": {
+            "path": str(sequence.path),
+            "format": sequence.format,
+            "frames": len(processed) if sequence.length is None else sequence.length,
+            "first_time": _number(trajectory.times[0] if len(trajectory) else np.nan),
+            "last_time": _number(trajectory.times[-1] if len(trajectory) else np.nan),
+            "view": sequence.view,
+            "notes": list(sequence.notes),
+            "skipped": [asdict(skipped) for skipped in sequence.skipped],
+        },
+        "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
+        "frontend": frontend.name,
+        "configuration": to_dict(settings),
+        "seed": settings.odometry.seed,
+        "versions": _versions(),
+        "interrupted": interrupted,
+        "scale": "unknown: the initial median depth is 1",
+        "frames": {
+            "processed": len(processed),
+            "tracked": int(has_pose.sum()),
+            "lost": int((~has_pose).sum()),
+            "lost_frames": np.flatnonzero(~has_pose).tolist(),
+            "source_index": processed,
+        },
+        "segments": [{**asdict(segment), "mean_error": _number(segment.mean_error)} for segment in odometry.segments],
+        "events": [asdict(event) for event in odometry.events],
+        "points": len(odometry.map),
+        "tracks": dict(tracks),
+        "seconds": {name: round(value, 3) for name, value in seconds.items()},
+        "frames_per_second": round(len(processed) / max(seconds["total"], 1e-9), 2),
+    }
+
+
+def _number(value: float) -> float | None:
+    """JSON has no NaN."""
+    return float(value) if np.isfinite(value) else None
+
+
+def _versions() -> dict[str, str]:
+    packages = ("numpy", "numba", "opencv-contrib-python-headless", "poselib")
+    return {"improvo": __version__, "python": platform.python_version(), **{name: version(name) for name in packages}}

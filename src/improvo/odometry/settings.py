@@ -1,0 +1,115 @@
+"""All settings of the odometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from improvo.backend.settings import ObjectiveSettings, SolverSettings
+from improvo.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class MatchingSettings:
+    """Matching of consecutive frames (paper, "Point Tracks")."""
+
+    max_distance: float = 0.7  # tau on unit descriptors; binary ones use the equivalent share of bits
+    max_stray: float = 0.0  # of a link from the frame's median motion, share of the width; 0: any, as in the paper
+    refind_radius: float = 8.0  # pixels at 640 wide: how far from its projection a lost map point is looked for
+    refind_frames: int = 60  # map points not seen for longer than this are not looked for
+
+    def __post_init__(self) -> None:
+        if not self.max_stray >= 0:
+            raise ConfigError(f"max_stray={self.max_stray}: is a share of the image width, 0 for no limit")
+
+
+@dataclass(frozen=True)
+class StartSettings:
+    """When two views are good enough to start a map (robust mode)."""
+
+    min_common_tracks: int = 30  # of the earliest view that the newest still overlaps
+    min_matches: int = 60  # between the two, matched afresh
+    min_rotation_residual: float = 2.0  # pixels, median that the best pure rotation leaves of the matches
+    max_waiting: int = 300  # frames kept while waiting for enough parallax
+    epipolar_error: float = 1.0  # pixels, RANSAC threshold of the essential matrix and of the homography
+    max_homography_ratio: float = 0.7  # homography inliers / essential inliers; more is too little parallax
+    # points of the essential matrix that the homography leaves; so many show parallax whatever the ratio is
+    min_off_plane_points: int = 60
+    plane_ratio: float = 0.8  # from here on the scene is mostly a plane, and its homography is decomposed
+    min_parallax_deg: float = 1.0
+    min_points: int = 30  # over the minimum parallax
+    min_inlier_share: float = 0.3  # essential inliers of the matches
+    max_mean_error: float = 1.2  # pixels, after adjustment and pruning
+    max_lost: int = 4  # waiting frames in a row, such as black ones, that may stay without a pose
+    max_patience: int = 30  # frames between two tries, doubled from 3 with each costly refusal
+
+
+@dataclass(frozen=True)
+class WindowSettings:
+    """Which poses the window adjusts."""
+
+    recent: int = 15  # last consecutive frames, free
+    keyframes: int = 15  # older keyframes, free
+    constants: int = 30  # still older keyframes, kept as constants with their observations
+    keyframe_motion: float = 0.05  # median pixel motion since the last keyframe, as a share of the image width
+    keyframe_shared: float = 0.6  # or: share of the last keyframe's map points still seen
+    keyframe_interval: int = 15  # or: frames since the last keyframe
+    max_error: float = 3.0  # pixels; observations over it are dropped, and the window is solved again
+    paper_poses: int = 30  # N_last, of the mode `paper`
+
+
+@dataclass(frozen=True)
+class TrackingLossSettings:
+    """When a frame, and when a segment, counts as lost."""
+
+    min_inliers: int = 12
+    min_inlier_share: float = 0.1
+    max_lost_frames: int = 10  # after this many frames without a pose the segment ends
+
+
+@dataclass(frozen=True)
+class HealthSettings:
+    """The independent check of the map against two views (see `improvo.odometry.health`)."""
+
+    interval: int = 5  # frames between two checks
+    gaps: tuple[int, ...] = (3, 6, 12)  # frames between the two views of a check
+    epipolar_error: float = 1.5  # pixels
+    min_inliers: int = 30  # of the two views' own essential matrix; fewer say nothing
+    min_inlier_share: float = 0.15  # of their matches
+    rounds: int = 3  # consecutive checks that are judged together
+    min_evidence: int = 100  # inliers in all of them; fewer decide nothing
+    min_agreement: float = 0.85  # right maps stay over 0.90, wrong ones fall under 0.80
+    young_frames: int = 60  # a map contradicted this early is started anew over the same frames
+
+
+@dataclass(frozen=True)
+class TrustSettings:
+    """Which keypoints a RANSAC may use, by their stability; a mover that fills its sample becomes the world."""
+
+    least_stability: float = 0.5  # of a keypoint, and of both ends of a match; 0 lets all in
+    enough: int = 50  # of them; where there are fewer, all are used, since a doubtful pose is better than none
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.least_stability <= 1:
+            raise ConfigError(f"trust.least_stability={self.least_stability}: is a probability between 0 and 1")
+
+
+@dataclass(frozen=True)
+class OdometrySettings:
+    """Settings of `VisualOdometry`."""
+
+    initialisation: str = "robust"  # `robust`, or `paper`: previous pose, unit depth, nothing else
+    seed: int = 0
+    matching: MatchingSettings = field(default_factory=MatchingSettings)
+    start: StartSettings = field(default_factory=StartSettings)
+    trust: TrustSettings = field(default_factory=TrustSettings)
+    window: WindowSettings = field(default_factory=WindowSettings)
+    loss: TrackingLossSettings = field(default_factory=TrackingLossSettings)
+    health: HealthSettings = field(default_factory=HealthSettings)
+    objective: ObjectiveSettings = field(default_factory=lambda: ObjectiveSettings(depth_weight=0.0))
+    solver: SolverSettings = field(default_factory=lambda: SolverSettings(max_iterations=8, relative_decrease=1e-3))
+    paper_objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)  # of the mode `paper`
+    paper_solver: SolverSettings = field(default_factory=lambda: SolverSettings(100, relative_decrease=1e-6))
+
+    def __post_init__(self) -> None:
+        if self.initialisation not in ("robust", "paper"):
+            raise ConfigError(f"initialisation {self.initialisation!r}: choose `robust` or `paper`")

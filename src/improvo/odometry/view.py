@@ -1,0 +1,107 @@
+"""One frame as the odometry holds it, and the points that its views observe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from improvo.odometry.settings import TrustSettings
+from improvo.types import Float32, Float64, Int64
+
+NO_POINT = -1
+Mask = NDArray[np.bool_]
+
+
+@dataclass(eq=False)
+class View:
+    """A frame with its features, tracks, map points and pose; mutable, internal to the odometry."""
+
+    position: int  # in the processed sequence, 0-based
+    time: float
+    keypoints: Float64  # (N, 2) pixels
+    descriptors: Float32  # (N, D) unit vectors
+    weights: Float64  # (N,) w_ij
+    tracks: Int64  # (N,) connect-the-dots track of each keypoint
+    points: Int64  # (N,) map point of each keypoint, or NO_POINT
+    cam_from_world: Float64 | None = None  # (4, 4)
+    keyframe: bool = False
+    final: bool = False
+    segment: int = -1  # number of the segment that the pose belongs to
+    followers: list[tuple[View, Float64]] = field(default_factory=list)
+    # views that left the window and move with this keyframe until it is final, with their cam_from_keyframe
+
+    @property
+    def observed(self) -> Int64:
+        """Rows of the keypoints that observe a map point."""
+        return np.flatnonzero(self.points >= 0)
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+
+class PointStore:
+    """Map points by id; grows, never reuses an id."""
+
+    def __init__(self) -> None:
+        self._xyz = np.zeros((1024, 3))
+        self._last_seen = np.full(1024, -1, np.int64)
+        self.count = 0
+
+    @property
+    def xyz(self) -> Float64:
+        """(P, 3) world, a view that may be written to."""
+        return self._xyz[: self.count]
+
+    @property
+    def last_seen(self) -> Int64:
+        """(P,) position of the last view that observed each point, a view that may be written to."""
+        return self._last_seen[: self.count]
+
+    def add(self, xyz: Float64, position: int) -> Int64:
+        """New points (N, 3), seen at `position`; returns their ids (N,)."""
+        ids = np.arange(self.count, self.count + len(xyz), dtype=np.int64)
+        needed = self.count + len(xyz)
+        if needed > len(self._xyz):
+            capacity = max(needed, 2 * len(self._xyz))
+            self._xyz = np.concatenate([self.xyz, np.zeros((capacity - self.count, 3))])
+            self._last_seen = np.concatenate([self.last_seen, np.full(capacity - self.count, -1, np.int64)])
+        self.count = needed
+        self._xyz[ids] = xyz
+        self._last_seen[ids] = position
+        return ids
+
+
+def common_tracks(a: View, b: View) -> tuple[Int64, Int64]:
+    """Rows of `a` and of `b` that belong to the same tracks."""
+    _, rows_a, rows_b = np.intersect1d(a.tracks, b.tracks, assume_unique=True, return_indices=True)
+    return rows_a.astype(np.int64), rows_b.astype(np.int64)
+
+
+def trusted_pairs(a: View, b: View, matches: Int64, trust: TrustSettings) -> Mask:
+    """Which of the matches (K, 2), rows of `a` and of `b`, a RANSAC may use: those trusted at both ends."""
+    return trusted(np.minimum(a.weights[matches[:, 0]], b.weights[matches[:, 1]]), trust)
+
+
+def trusted(weights: Float64, trust: TrustSettings) -> Mask:
+    """(N,) which of the weights w_ij are high enough for a RANSAC; all, where those would be too few."""
+    stable = weights >= trust.least_stability
+    return stable if stable.sum() >= trust.enough else np.ones(len(weights), bool)
+
+
+def inherit_points(view: View, neighbour: View) -> None:
+    """Keypoints of `view` without a point take the point that their track has in `neighbour`."""
+    rows, rows_neighbour = common_tracks(view, neighbour)
+    free = view.points[rows] < 0
+    view.points[rows[free]] = neighbour.points[rows_neighbour[free]]
+    _keep_first_of_each_point(view)
+
+
+def _keep_first_of_each_point(view: View) -> None:
+    """A point is observed once per view."""
+    rows = view.observed
+    _, first = np.unique(view.points[rows], return_index=True)
+    duplicates = np.ones(len(rows), bool)
+    duplicates[first] = False
+    view.points[rows[duplicates]] = NO_POINT

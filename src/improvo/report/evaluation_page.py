@@ -1,0 +1,76 @@
+"""`report.html` of an evaluation: its tables as printed, its curves, and what the numbers mean."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from improvo.errors import InputError
+from improvo.report.page import Page
+
+# evaluation -> (title, what the numbers mean)
+EVALUATIONS = {
+    "pose": (
+        "Pose estimation from 3D-to-2D matches",
+        "The share of image pairs whose relative pose is right, by frontend and solver (paper, Table 1). A frontend is "
+        "better only if it is better under the robust solver too: the solver moves this table more than the frontend.",
+    ),
+    "trajectory": (
+        "Trajectory against ground truth",
+        "Errors after alignment, over the whole path (ATE) and over stretches of fixed duration (paper, Table 2).",
+    ),
+    "vo": (
+        "Visual odometry with and without stability",
+        "Relative errors over stretches of the trajectory, with observations weighed by stability or all alike (paper, "
+        "Table 2).",
+    ),
+    "homography": (
+        "Homography estimation",
+        "How well keypoints repeat and match between pictures of a plane, and how right the estimated homography is.",
+    ),
+    "stability": (
+        "Instability against its true cause",
+        "In simulation it is known what makes a point unstable; this counts how often label and classifier agree.",
+    ),
+}
+
+
+def write_evaluation_page(folder: Path, path: Path) -> None:
+    """Write the page of every evaluation that the folder holds.
+
+    Raises:
+        InputError: it holds none, or one that cannot be read.
+    """
+    found = [name for name in EVALUATIONS if (folder / f"{name}.json").is_file()]
+    if not found:
+        raise InputError(f"{folder}: has no results of `improvo evaluate`; check the folder")
+    page = Page(EVALUATIONS[found[0]][0] if len(found) == 1 else "Evaluation", f"Results in {folder}.")
+    for name in found:
+        title, meaning = EVALUATIONS[name]
+        if len(found) > 1:
+            page.heading(title)
+        page.paragraph(meaning)
+        _tables(page, folder, name)
+    for picture in sorted(folder.glob("*.png")):
+        page.picture(picture, f"{picture.stem.replace('-', ', ')}: accuracy over thresholds; further up is better.")
+    for name in found:
+        page.details(f"{name}.json", _indented(folder / f"{name}.json"))
+    page.write(path)
+
+
+def _tables(page: Page, folder: Path, name: str) -> None:
+    try:
+        page.markdown((folder / f"{name}.md").read_text())
+    except OSError:
+        raise InputError(f"{folder / name}.md: is missing; run `improvo evaluate {name}` again") from None
+
+
+_LONGEST = 200_000  # characters of a result that are worth embedding
+
+
+def _indented(path: Path) -> str:
+    try:
+        text = json.dumps(json.loads(path.read_text()), indent=1)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); run the evaluation again") from None
+    return text if len(text) <= _LONGEST else text[:_LONGEST] + f"\n... {len(text) - _LONGEST} more characters"

@@ -1,0 +1,67 @@
+"""`report.html` of labelled sequences: totals, what failed and why, and each sequence's map and warnings."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from improvo.labeling.store import DONE, read_records
+from improvo.report.map_picture import draw_map
+from improvo.report.page import Page
+from improvo.report.palettes import PALETTES, Palette
+from improvo.report.plain_words import warnings
+from improvo.report.run_folder import RunFolder
+
+_MAX_MAPS = 12
+_COLUMNS = (
+    "name", "state", "frames", "tracked", "trusted", "segments", "tracks", "stable", "unstable", "ignore", "withheld",
+    "seconds",
+)  # fmt: skip
+
+
+def write_label_page(folder: Path, path: Path, palette: Palette = PALETTES["paper"]) -> None:
+    """Write the page of a folder of `improvo label`.
+
+    Raises:
+        InputError: a record cannot be read.
+    """
+    rows = [asdict(record) for record in read_records(folder)]
+    runs = [RunFolder(run_json.parent) for run_json in sorted(folder.glob("[!.]*/run.json"))]
+    totals = {name: sum(int(row[name]) for row in rows) for name in ("stable", "unstable", "ignore", "withheld")}
+    page = Page(f"Labels of {len(rows)} sequences", f"In {folder}.")
+    page.tiles(
+        [
+            (f"{len(runs)} of {len(rows)}", "sequences with labels"),
+            (f"{sum(int(row['tracked']) for row in rows):,}", "frames with a pose"),
+            *((f"{count:,}", f"{name} tracks") for name, count in totals.items()),
+        ]
+    )
+    failed = [f"{row['name']} has no labels: {row['reason']}." for row in rows if row["state"] != DONE]
+    page.warnings(failed, "Every sequence has labels.")
+    page.heading("Sequences")
+    page.table(_COLUMNS, [[_words(row[name]) for name in _COLUMNS] for row in rows])
+    page.paragraph(
+        "Withheld: tracks whose label the second opinion took away, because the odometry is not to be trusted where "
+        "they were seen.",
+        note=True,
+    )
+    for run in runs[:_MAX_MAPS]:
+        page.html("<h3>" + run.name.replace("&", "&amp;").replace("<", "&lt;") + "</h3>")
+        page.warnings(
+            warnings(run.report, np.zeros(0, np.int64), np.zeros(0), float("nan")),
+            "Every frame has a pose in one piece.",
+        )
+        if len(run.trajectory):
+            with tempfile.TemporaryDirectory() as temporary:
+                picture = Path(temporary) / "map.png"
+                draw_map(run, picture, palette)
+                page.picture(picture, f"{run.name} from above")
+    page.write(path)
+
+
+def _words(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else ("-" if value is None else str(value))

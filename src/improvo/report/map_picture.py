@@ -1,0 +1,125 @@
+"""The overhead projection of trajectory and map (paper, Figure "Labeling points with VO", row b)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from improvo.errors import InputError
+from improvo.files import written_atomically
+from improvo.report.overhead import overhead_axes, robust_limits
+from improvo.report.palettes import PALETTES, Palette
+from improvo.report.run_folder import RunFolder
+from improvo.types import SparseMap
+
+_BACKGROUND = "#565b63"  # neither the paper's black (last window) nor its white (points)
+_LAST_POSES = 30  # N_last
+
+
+def draw_map(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"], last_poses: int = _LAST_POSES) -> None:
+    """Write the picture as PNG: points white, the trajectory from blue to red over time, the last window black.
+
+    Raises:
+        InputError: no frame of the run has a pose.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+
+    trajectory = run.trajectory
+    if len(trajectory) == 0:
+        raise InputError(f"{run.path}: no frame has a pose, so there is no map to draw; see `events` in run.json")
+    axes_of_world = overhead_axes(trajectory.world_from_cam)
+    path_2d = axes_of_world.project(trajectory.positions)
+    shown = trusted_points(run.map)
+    points_2d = axes_of_world.project(run.map.xyz[shown])
+    low, high = robust_limits(path_2d, points_2d)
+    width, height = _figure_size(high - low)
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    axis = figure.subplots()
+    axis.set_facecolor(_BACKGROUND)
+    inside = ((points_2d > low) & (points_2d < high)).all(axis=1)
+    size, alpha = _point_style(int(inside.sum()))
+    axis.scatter(
+        points_2d[inside, 0],
+        points_2d[inside, 1],
+        s=size,
+        c="white",
+        alpha=alpha,
+        linewidths=0,
+        zorder=1,
+        rasterized=True,
+    )
+
+    links = np.stack([path_2d[:-1], path_2d[1:]], axis=1)
+    joined = trajectory.segment[:-1] == trajectory.segment[1:]
+    colours = palette.ramp_colours(run.positions[1:].astype(float), 0, max(run.frames - 1, 1)) / 255.0
+    axis.add_collection(
+        LineCollection(list(links[joined]), colors=colours[joined], linewidths=3.0, capstyle="round", zorder=3)
+    )
+    axis.add_collection(
+        LineCollection(list(links[~joined]), colors="white", linewidths=1.0, linestyles="dotted", zorder=2)
+    )
+    last = path_2d[-last_poses:]
+    axis.plot(*last.T, color="white", linewidth=5.5, solid_capstyle="round", zorder=4)
+    axis.plot(*last.T, color="black", linewidth=3.5, solid_capstyle="round", zorder=5)
+    axis.plot(*path_2d[0], "o", color=tuple(colours[0]), markeredgecolor="white", markersize=8, zorder=6)
+    axis.annotate("start", path_2d[0], (6, 6), textcoords="offset points", color="white", fontsize=9, zorder=7)
+    for number in np.unique(trajectory.segment)[1:]:
+        first = path_2d[np.flatnonzero(trajectory.segment == number)[0]]
+        axis.annotate(
+            f"segment {number}", first, (6, -12), textcoords="offset points", color="white", fontsize=8, zorder=7
+        )
+
+    axis.set_xlim(low[0], high[0])
+    axis.set_ylim(low[1], high[1])
+    axis.set_aspect("equal")
+    axis.grid(color="white", alpha=0.12, linewidth=0.6)
+    axis.tick_params(labelsize=8)
+    axis.set_xlabel("right of the first camera (map units: the first median depth is 1)", fontsize=8)
+    axis.set_ylabel("ahead of the first camera", fontsize=8)
+    axis.set_title(_title(run, len(shown), int((~inside).sum())), fontsize=10)
+    _time_bar(figure, axis, palette, run.frames, len(last))
+    with written_atomically(path) as temporary:
+        figure.savefig(temporary, dpi=150, format="png", bbox_inches="tight", metadata={"Software": None})
+
+
+def trusted_points(sparse_map: SparseMap) -> NDArray[np.intp]:
+    """Rows of the points that are worth drawing: seen at least three times, and with an ordinary error."""
+    good = (sparse_map.observations >= 3) & (sparse_map.mean_error < 2.0) & np.isfinite(sparse_map.xyz).all(axis=1)
+    return np.flatnonzero(good)
+
+
+def _title(run: RunFolder, points: int, outside: int) -> str:
+    frames, segments = run.report["frames"], run.report["segments"]
+    parts = [f"{frames['tracked']} of {frames['processed']} frames have a pose", f"{points} points"]
+    if outside:
+        parts.append(f"{outside} far ones outside the picture")
+    if len(segments) > 1:
+        parts.append(f"{len(segments)} segments, each with its own scale, placed by guess")
+    return f"{run.name}, {run.report['frontend']}, seen from above\n" + "; ".join(parts)
+
+
+def _figure_size(extent: NDArray[np.float64]) -> tuple[float, float]:
+    """Inches, near the shape of what is drawn."""
+    shape = float(np.clip(extent[0] / extent[1], 0.4, 2.6))
+    return (8.6, 8.6 / shape + 1.7) if shape >= 1 else (7.0 * shape + 2.8, 7.0 + 1.2)
+
+
+def _point_style(count: int) -> tuple[float, float]:
+    """Area and opacity of a point, so that many still show structure."""
+    return float(np.clip(20_000 / max(count, 1), 1.2, 8.0)), float(np.clip(8_000 / max(count, 1), 0.35, 0.9))
+
+
+def _time_bar(figure: object, axis: object, palette: Palette, frames: int, last: int) -> None:
+    """What the colours mean."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    scale = ScalarMappable(Normalize(0, max(frames - 1, 1)), palette.colormap())
+    bar = figure.colorbar(scale, ax=axis, fraction=0.035, pad=0.02)  # type: ignore[attr-defined]
+    bar.set_label(f"frame (black: the last {last})", fontsize=8)
+    bar.ax.tick_params(labelsize=8)

@@ -1,0 +1,139 @@
+"""One self-contained HTML file: no network, opens from disk, reads on a phone and in print."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Sequence
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from improvo.files import write_text
+
+
+class Page:
+    """Collects sections, then writes them.
+
+    Text arguments are plain text and are escaped; only `html` takes markup.
+
+    Args:
+        title: of the page.
+        lead: one line below it.
+    """
+
+    def __init__(self, title: str, lead: str) -> None:
+        self._title = title
+        self._body = [f"<h1>{escape(title)}</h1>", f'<p class="lead">{escape(lead)}</p>']
+        self._scripts: list[str] = []
+
+    def html(self, markup: str) -> None:
+        """Append trusted markup."""
+        self._body.append(markup)
+
+    def heading(self, text: str) -> None:
+        """Begin a section."""
+        self._body.append(f"<h2>{escape(text)}</h2>")
+
+    def paragraph(self, text: str, note: bool = False) -> None:
+        """A paragraph; `note` sets it small."""
+        opening = '<p class="note">' if note else "<p>"
+        self._body.append(f"{opening}{escape(text)}</p>")
+
+    def tiles(self, numbers: Sequence[tuple[str, str]]) -> None:
+        """The main numbers: (value, meaning)."""
+        tiles = "".join(
+            f'<div class="tile"><b>{escape(value)}</b><span>{escape(text)}</span></div>' for value, text in numbers
+        )
+        self._body.append(f'<div class="tiles">{tiles}</div>')
+
+    def warnings(self, lines: Sequence[str], fine: str) -> None:
+        """What to look out for, in plain words; `fine` is said where there is nothing."""
+        items = "".join(f"<li>{escape(line)}</li>" for line in lines) or f'<li class="fine">{escape(fine)}</li>'
+        self._body.append(f'<ul class="warnings">{items}</ul>')
+
+    def table(self, header: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "") -> None:
+        """A table; cells wrapped in ** are bold."""
+        head = "".join(f"<th>{_cell(cell)}</th>" for cell in header)
+        body = "".join("<tr>" + "".join(f"<td>{_cell(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+        self._body.append(
+            f'<figure><div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+            f"{below}</figure>"
+        )
+
+    def bars(self, header: Sequence[str], rows: Sequence[tuple[str, float, str]]) -> None:
+        """A table of (name, value, value in words) with a bar for each value."""
+        largest = max((value for _, value, _ in rows), default=0.0) or 1.0
+        body = "".join(
+            f'<tr><td>{escape(name)}</td><td>{escape(words)}</td><td class="bar">'
+            f'<i style="width:{100 * value / largest:.1f}%"></i></td></tr>'
+            for name, value, words in rows
+        )
+        head = "".join(f"<th>{escape(cell)}</th>" for cell in (*header, ""))
+        self._body.append(
+            f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+        )
+
+    def markdown(self, text: str) -> None:
+        """Our own Markdown subset: headings, paragraphs, lists and tables, as the evaluations print them."""
+        for block in re.split(r"\n\s*\n", text.strip()):
+            lines = block.strip().splitlines()
+            table = [line for line in lines if line.lstrip().startswith("|")]
+            items = [line for line in lines if line.startswith("- ")]
+            rest = [line for line in lines if line not in table and line not in items]
+            if items:
+                self.html("<ul>" + "".join(f"<li>{_cell(item[2:])}</li>" for item in items) + "</ul>")
+            for line in rest:
+                if line.startswith("#"):
+                    self.html(f"<h3>{escape(line.lstrip('# '))}</h3>")
+                elif line.strip():
+                    self.html(f"<p>{_cell(line)}</p>")
+            rows = [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in table]
+            rows = [row for row in rows if not all(re.fullmatch(r":?-+:?", cell) for cell in row)]
+            if rows:
+                self.table(rows[0], rows[1:])
+
+    def picture(self, content: bytes | Path, caption: str) -> None:
+        """A PNG or JPEG, embedded."""
+        content = content.read_bytes() if isinstance(content, Path) else content
+        kind = "png" if content.startswith(b"\x89PNG") else "jpeg"
+        source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+        self._body.append(
+            f'<figure><img src="{source}" alt="{escape(caption, quote=True)}"><figcaption>{escape(caption)}'
+            "</figcaption></figure>"
+        )
+
+    def details(self, summary: str, text: str) -> None:
+        """Text that unfolds."""
+        self._body.append(f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>")
+
+    def script(self, asset: str, data_id: str, data: Any) -> None:
+        """A script of ours, and the data that it reads from the element `data_id`."""
+        text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
+        self._body.append(f'<script type="application/json" id="{data_id}">{text}</script>')
+        self._scripts.append(_asset(asset))
+
+    def write(self, path: Path) -> None:
+        """Write the file atomically."""
+        from improvo import __version__
+
+        scripts = "".join(f"<script>{script}</script>\n" for script in self._scripts)
+        write_text(
+            path,
+            '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+            '<meta name="viewport" content="width=device-width, initial-scale=1">'
+            f'<link rel="icon" href="data:,"><title>{escape(self._title)}</title><style>{_asset("page.css")}</style>'
+            f"</head><body>\n{chr(10).join(self._body)}\n"
+            f'<p class="note">Written by improvo {__version__}.</p>\n{scripts}</body></html>\n',
+        )
+
+
+def _asset(name: str) -> str:
+    return files("improvo.report").joinpath("assets", name).read_text()
+
+
+def _cell(text: str) -> str:
+    return re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", escape(text))

@@ -1,0 +1,82 @@
+"""What a user should know about a run, in plain words, from `run.json`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from improvo.types import Float64, Int64
+
+_DARK = 25.0  # mean grey value below which features become rare
+
+
+def warnings(report: dict[str, Any], positions: Int64, brightness: Float64, median_error: float) -> list[str]:
+    """One line for each thing that is wrong or doubtful, the gravest first.
+
+    Args:
+        report: the content of run.json.
+        positions: (N,) frames whose brightness is known.
+        brightness: (N,) mean grey value.
+        median_error: pixels, over all observations; NaN without any.
+    """
+    lines = []
+    frames, segments = report["frames"], report["segments"]
+    if report["interrupted"]:
+        lines.append(f"The run was interrupted after {frames['processed']} frames; it is complete up to there.")
+    if frames["tracked"] == 0:
+        lines.append(
+            "No frame has a pose: the camera moved too little, only turned, or saw too little texture. Move sideways."
+        )
+    lines += _events(report)
+    if frames["lost"]:
+        lines.append(f"{frames['lost']} of {frames['processed']} frames have no pose: {ranges(frames['lost_frames'])}.")
+    if len(segments) > 1:
+        starts = ", ".join(str(segment["first"]) for segment in segments[1:])
+        lines.append(
+            f"The trajectory is in {len(segments)} pieces (new ones start at frames {starts}). Each has its own scale, "
+            "and where they stand to each other is a guess."
+        )
+    skipped = report["input"]["skipped"]
+    if skipped:
+        first = skipped[0]
+        lines.append(f"{len(skipped)} frames could not be read, the first is {first['source']}: {first['reason']}.")
+    lines += [f"About the recording: {note}." for note in report["input"]["notes"]]
+    dark = positions[brightness < _DARK]
+    if len(dark):
+        lines.append(f"Dark frames (mean grey value under {_DARK:g} of 255): {ranges(dark.tolist())}.")
+    if np.isfinite(median_error) and median_error > 1.5:
+        lines.append(
+            f"The median re-projection error is {median_error:.1f} px; 0.2 to 1 is usual. Check the calibration "
+            "(`improvo info`), rolling shutter and blur."
+        )
+    return lines
+
+
+def _events(report: dict[str, Any]) -> list[str]:
+    lines = []
+    by_kind: dict[str, list[dict[str, Any]]] = {}
+    for event in report["events"]:
+        by_kind.setdefault(event["kind"], []).append(event)
+    for kind, word in (("lost", "Lost"), ("contradiction", "Doubtful")):
+        lines += [f"{word} at frame {event['position']}: {event['detail']}." for event in by_kind.pop(kind, [])[:5]]
+    waiting = by_kind.pop("waiting", [])
+    if waiting and report["frames"]["lost"]:  # frames that only waited get their pose once the map has begun
+        last = waiting[-1]
+        lines.append(f"The map could not begin; the last reason, at frame {last['position']}: {last['detail']}.")
+    by_kind.pop("segment", None)  # said by the number of pieces
+    for kind, events in by_kind.items():
+        lines.append(f"{kind.capitalize()} at frame {events[0]['position']}: {events[0]['detail']}.")
+    return lines
+
+
+def ranges(numbers: list[int]) -> str:
+    """`3, 7-9, 12`, at most eight parts."""
+    parts: list[list[int]] = []
+    for number in numbers:
+        if parts and number == parts[-1][1] + 1:
+            parts[-1][1] = number
+        else:
+            parts.append([number, number])
+    words = [str(first) if first == last else f"{first}-{last}" for first, last in parts]
+    return ", ".join(words[:8]) + (f" and {len(words) - 8} more stretches" if len(words) > 8 else "")

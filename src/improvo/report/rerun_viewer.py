@@ -1,0 +1,193 @@
+"""The live viewer: camera, image, tracks, map and timings in Rerun, while a run goes on or of a finished one.
+
+Entities are named as in Rerun's own SLAM examples: `world/points`, `world/camera/image`, `world/trajectory`.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from improvo.errors import MissingExtraError, OutputError
+from improvo.files import written_atomically
+from improvo.geometry import se3
+from improvo.geometry.camera import Camera
+from improvo.labeling.stability import IGNORE
+from improvo.odometry.view import View
+from improvo.report.palettes import PALETTES, Palette
+from improvo.report.run_folder import RunFolder
+from improvo.types import Float64, Frame, UInt8
+
+_OLD = 30  # frames; the last colour of the age of a track
+_MAP_EVERY = 10  # frames between two pictures of the whole map
+
+
+class RerunViewer:
+    """An `improvo.odometry.viewer.Viewer` that shows a run in Rerun.
+
+    Args:
+        save: a `.rrd` file to write, which works without a screen; None opens the viewer.
+        palette: colours.
+
+    Raises:
+        MissingExtraError: Rerun is not installed.
+        OutputError: the file cannot be written.
+    """
+
+    def __init__(self, save: Path | None = None, palette: Palette = PALETTES["paper"]) -> None:
+        self._recording = _Recording(save)
+        self._palette = palette
+        self._births: dict[int, int] = {}  # track -> the frame where it began
+        self._path: list[Float64] = []
+        self._segment = -1
+        self._last_shown = time.perf_counter()
+
+    def begin(self, camera: Camera) -> None:
+        """A run begins."""
+        self._recording.open(camera)
+        self._last_shown = time.perf_counter()
+
+    def show(self, frame: Frame, view: View, points: Float64) -> None:
+        """A frame was processed."""
+        recording, now = self._recording, time.perf_counter()
+        recording.at(view.position, view.time)
+        self._births = {track: self._births.get(track, view.position) for track in view.tracks.tolist()}
+        age = view.position - np.array([self._births[track] for track in view.tracks.tolist()], np.int64)
+        colours = self._palette.ramp_colours(age, 0, _OLD)
+        recording.image(frame.image)
+        recording.keypoints(view.keypoints, colours)
+        recording.scalar("plots/tracks", float((age > 0).sum()))
+        recording.scalar("plots/points_observed", float(len(view.observed)))
+        recording.scalar("plots/milliseconds_per_frame", 1000.0 * (now - self._last_shown))
+        self._last_shown = now
+        if view.cam_from_world is not None:
+            self._show_pose(view, points)
+
+    def _show_pose(self, view: View, points: Float64) -> None:
+        assert view.cam_from_world is not None
+        world_from_cam = se3.inverse(view.cam_from_world)
+        if view.segment != self._segment:
+            self._segment, self._path = view.segment, []
+        self._path.append(world_from_cam[:3, 3])
+        self._recording.pose(world_from_cam)
+        self._recording.trajectory(np.array(self._path), self._palette)
+        if len(points) and view.position % _MAP_EVERY == 0:
+            self._recording.points(points, np.full((len(points), 3), 200, np.uint8))
+        seen = view.points[view.observed]
+        if len(seen) and int(seen.max()) < len(points):
+            weights = view.weights[view.observed]  # stability, or 1 without that head
+            self._recording.points(points[seen], self._palette.ramp_colours(1 - weights, 0, 1), "world/observed")
+
+    def end(self) -> None:
+        """The run is over."""
+        self._recording.close()
+
+
+def show_run(
+    run: RunFolder, save: Path | None = None, palette: Palette = PALETTES["paper"], images: bool = True
+) -> None:
+    """A finished run in Rerun: as `RerunViewer`, with the map coloured by the stability labels.
+
+    Args:
+        run: the finished run.
+        save: a `.rrd` file to write; None opens the viewer.
+        palette: colours.
+        images: show the frames too; needs the recording.
+    """
+    recording = _Recording(save)
+    recording.open(run.camera)
+    row_of_position = {int(position): row for row, position in enumerate(run.positions)}
+    times = run.sequence.times if images else np.zeros(0)
+    labelled = np.flatnonzero((run.points.stability != IGNORE) & np.isfinite(run.points.xyz).all(axis=1))
+    recording.points(
+        run.points.xyz[labelled], palette.label_colours(run.points.stability[labelled]), "world/labels", static=True
+    )
+    recording.points(run.map.xyz, np.full((len(run.map), 3), 200, np.uint8), static=True)
+    recording.trajectory(run.trajectory.positions, palette, static=True)
+    for position in range(run.frames):
+        row = row_of_position.get(position)
+        recording.at(position, float(run.trajectory.times[row]) if row is not None else _time(times, run, position))
+        if images:
+            recording.image(run.image(position))
+        seen = run.observations(position)
+        recording.keypoints(seen.keypoints, palette.label_colours(seen.stability))
+        recording.scalar("plots/tracks", float((seen.age > 0).sum()))
+        if np.isfinite(seen.error).any():
+            recording.scalar("plots/median_error", float(np.nanmedian(seen.error)))
+        if row is not None:
+            recording.pose(run.trajectory.world_from_cam[row])
+    recording.close()
+
+
+def _time(times: Float64, run: RunFolder, position: int) -> float:
+    """Seconds of a frame without a pose."""
+    rows = np.flatnonzero(run.sequence.indices == run.source_index[position]) if len(times) else np.zeros(0, np.int64)
+    return float(times[rows[0]]) if len(rows) else float(position)
+
+
+class _Recording:
+    """Rerun's recording stream, in our nouns."""
+
+    def __init__(self, save: Path | None) -> None:
+        try:
+            import rerun
+        except ImportError:
+            raise MissingExtraError("the live viewer", "view") from None
+        if save is not None and not save.absolute().parent.is_dir():
+            raise OutputError(f"{save}: no folder {save.parent}; make it first")
+        self._rerun: Any = rerun
+        self._save = save
+        self._files = ExitStack()
+        self._stream: Any = None
+
+    def open(self, camera: Camera) -> None:
+        self._stream = self._rerun.RecordingStream("improvo")
+        if self._save is None:
+            self._stream.spawn()
+        else:
+            self._stream.save(str(self._files.enter_context(written_atomically(self._save))))
+        self._log("world", self._rerun.ViewCoordinates.RDF, static=True)
+        pinhole = self._rerun.Pinhole(
+            image_from_camera=camera.K, resolution=[camera.width, camera.height], image_plane_distance=0.15
+        )
+        self._log("world/camera/image", pinhole, static=True)
+
+    def close(self) -> None:
+        self._stream.flush()
+        self._stream.disconnect()
+        self._files.close()
+
+    def _log(self, path: str, what: Any, static: bool = False) -> None:
+        self._stream.log(path, what, static=static)
+
+    def at(self, position: int, seconds: float) -> None:
+        """What follows belongs to this frame."""
+        self._stream.set_time("frame", sequence=position)
+        self._stream.set_time("time", duration=seconds)
+
+    def image(self, image: UInt8) -> None:
+        self._log("world/camera/image", self._rerun.Image(image, color_model="L").compress(jpeg_quality=75))
+
+    def keypoints(self, pixels: Float64, colours: UInt8) -> None:
+        # Rerun's pixel centres are at one half
+        self._log("world/camera/image/keypoints", self._rerun.Points2D(pixels + 0.5, colors=colours, radii=2.0))
+
+    def pose(self, world_from_cam: Float64) -> None:
+        transform = self._rerun.Transform3D(translation=world_from_cam[:3, 3], mat3x3=world_from_cam[:3, :3])
+        self._log("world/camera", transform)
+
+    def points(self, xyz: Float64, colours: UInt8, path: str = "world/points", static: bool = False) -> None:
+        self._log(path, self._rerun.Points3D(xyz, colors=colours, radii=self._rerun.Radius.ui_points(1.5)), static)
+
+    def trajectory(self, centres: Float64, palette: Palette, static: bool = False) -> None:
+        if len(centres) > 1:
+            links = np.stack([centres[:-1], centres[1:]], axis=1)
+            colours = palette.ramp_colours(np.arange(len(links)), 0, len(links))
+            self._log("world/trajectory", self._rerun.LineStrips3D(links, colors=colours), static)
+
+    def scalar(self, path: str, value: float) -> None:
+        self._log(path, self._rerun.Scalars(value))

@@ -1,0 +1,196 @@
+"""`report.html` of a run: what was run, what came out, and what to look out for."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from improvo.errors import InputError
+from improvo.report.charts import line_chart
+from improvo.report.map_picture import draw_map
+from improvo.report.page import Page
+from improvo.report.page_data import frames_data, per_frame, scene_data
+from improvo.report.palettes import PALETTES, Palette
+from improvo.report.plain_words import warnings
+from improvo.report.run_folder import RunFolder
+
+_MAX_FRAMES = 150  # of the slider
+_FRAME_WIDTH = 480
+
+_SCENE = """
+<div class="controls only-screen">
+<label><input type="radio" name="layer" value="map" checked> map points</label>
+<label><input type="radio" name="layer" value="labels"> points by label</label>
+<button type="button" id="scene-reset">Reset</button><button type="button" id="scene-above">From above</button>
+<span class="legend">trajectory: first <i class="ramp" style="background:{gradient}"></i> last; black: last window;
+yellow: the frame below</span></div>
+<canvas class="scene" id="scene" tabindex="0" aria-label="3D map: drag to turn, shift-drag to move, wheel to zoom">
+</canvas>
+<p class="note only-screen">Drag turns, shift or right button moves, wheel or two fingers zoom; arrow keys and + - too.
+</p>"""
+
+_FRAMES = """
+<div class="controls only-screen"><button type="button" id="frame-play">Play</button>
+<input type="range" id="frame-slider" min="0" max="{last}" value="{middle}" aria-label="frame">
+<label><input type="radio" name="overlay" value="tracks" checked> tracks</label>
+<label><input type="radio" name="overlay" value="labels"> labels</label>
+<label><input type="radio" name="overlay" value="residuals"> residuals</label>
+<label><input type="radio" name="overlay" value="none"> none</label></div>
+<figure><canvas id="frame" width="{width}" height="{height}"></canvas>
+<figcaption><span id="frame-caption"></span><br>
+<span class="legend" data-legend="tracks">age: new <i class="ramp" style="background:{gradient}"></i> 30 frames</span>
+<span class="legend" data-legend="labels" hidden>{labels}</span>
+<span class="legend" data-legend="residuals" hidden>re-projection error: 0
+<i class="ramp" style="background:{gradient}"></i> 3 px</span></figcaption></figure>"""
+
+
+def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"]) -> None:
+    """Write the page; without the recording, the frame slider is left out and the page says so."""
+    report = run.report
+    frames = report["frames"]
+    count = min(run.frames, _MAX_FRAMES)
+    chosen = [round(i) for i in np.linspace(0, run.frames - 1, count)]
+    try:
+        data, brightness = frames_data(run, chosen, palette, min(_FRAME_WIDTH, run.camera.width))
+        missing = ""
+    except InputError as error:
+        data, brightness, missing = {"frames": []}, np.zeros(0), str(error)
+    shown = np.array([frame["position"] for frame in data["frames"]], np.int64)
+    known = run.tracks.error[np.isfinite(run.tracks.error)]
+    median_error = float(np.median(known)) if len(known) else float("nan")
+
+    page = Page(
+        f"Visual odometry of {run.name}",
+        f"{frames['processed']} frames of {run.camera.width}x{run.camera.height}, {report['input']['format']}; "
+        f"frontend {report['frontend']}; poses and map are up to scale.",
+    )
+    tracks = run.points.counts()
+    page.tiles(
+        [
+            (f"{frames['tracked']} of {frames['processed']}", "frames with a pose"),
+            (str(len(report["segments"])), "pieces (1 is best)"),
+            (f"{report['points']:,}", "map points"),
+            (f"{median_error:.2f} px" if np.isfinite(median_error) else "-", "median re-projection error"),
+            (f"{report['frames_per_second']:g}", "frames per second"),
+            (f"{tracks['stable']:,} / {tracks['unstable']:,}", "stable / unstable tracks"),
+        ]
+    )
+    page.heading("What to look out for")
+    page.warnings(warnings(report, shown, brightness, median_error), "Nothing: every frame has a pose in one piece.")
+    if len(run.trajectory):
+        _map_section(page, run, palette)
+    _frames_section(page, run, data, palette, missing)
+    _charts_section(page, run)
+    _labels_section(page, run)
+    _timing_section(page, run)
+    page.write(path)
+
+
+def _map_section(page: Page, run: RunFolder, palette: Palette) -> None:
+    page.heading("Map and trajectory")
+    page.html(_SCENE.format(gradient=_gradient(palette)))
+    page.script("scene.js", "scene-data", scene_data(run, palette))
+    with tempfile.TemporaryDirectory() as folder:
+        picture = Path(folder) / "map.png"
+        draw_map(run, picture, palette)
+        page.picture(
+            picture,
+            "Seen from above: points white, the trajectory from blue to red over time, the last window black."
+            if palette.name == "paper"
+            else "Seen from above: points white, the trajectory from dark to bright over time, the last window black.",
+        )
+
+
+def _frames_section(page: Page, run: RunFolder, data: dict[str, object], palette: Palette, missing: str) -> None:
+    page.heading("Frames")
+    frames = data["frames"]
+    assert isinstance(frames, list)
+    if not frames:
+        page.paragraph(f"The pictures could not be shown: {missing or 'no frame could be read again'}.")
+        return
+    width = min(2 * _FRAME_WIDTH, 2 * run.camera.width)
+    colours = palette.label_colours(np.array([2, 1, 0]))
+    labels = " ".join(
+        f'<i class="swatch" style="background:rgb{tuple(colour.tolist())}"></i> {name}'
+        for colour, name in zip(colours, ("stable", "unstable", "ignored"), strict=True)
+    )
+    page.html(
+        _FRAMES.format(
+            last=len(frames) - 1,
+            middle=len(frames) // 2,
+            width=width,
+            height=round(width * run.camera.height / run.camera.width),
+            gradient=_gradient(palette),
+            labels=labels,
+        )
+    )
+    if len(frames) < run.frames:
+        page.paragraph(f"{len(frames)} frames, spread evenly over the run; `improvo show` draws all.", note=True)
+    page.script("frames.js", "frame-data", data)
+
+
+def _charts_section(page: Page, run: RunFolder) -> None:
+    page.heading("Over time")
+    x = np.arange(run.frames, dtype=np.float64)
+    tracks = per_frame(run, lambda rows: float((run.tracks.frame[rows] > run.birth[rows]).sum()))
+    page.html(
+        f"<figure>{line_chart(x, tracks, 'tracks per frame')}<figcaption>Points per frame that were also seen in the "
+        "frame before.</figcaption></figure>"
+    )
+
+    def middle(rows: np.ndarray) -> float:
+        error = run.tracks.error[rows]
+        error = error[np.isfinite(error)]
+        return float(np.median(error)) if len(error) else float("nan")
+
+    errors = per_frame(run, middle)
+    page.html(
+        f"<figure>{line_chart(x, errors, 'median re-projection error per frame')}<figcaption>Median re-projection "
+        "error per frame in pixels, of all raw tracks under the final poses; a gap where there is no pose.</figcaption>"
+        "</figure>"
+    )
+
+
+def _labels_section(page: Page, run: RunFolder) -> None:
+    tracks, rule = run.points.counts(), run.report["configuration"]["labels"]
+    page.heading("Labels")
+    page.paragraph(
+        f"A track of at least {rule['min_observations']} observations is stable if its mean re-projection error is "
+        f"at most {rule['stable_mean_error']:g} px, unstable if its largest is at least "
+        f"{rule['unstable_max_error']:g} px, and ignored otherwise. Labels are what the frontend learns from."
+    )
+    names = ("stable", "unstable", "ignore", "withheld")
+    rows = [(name, float(tracks[name]), f"{tracks[name]:,}") for name in names]
+    page.bars(("label", "tracks"), rows)
+
+
+def _timing_section(page: Page, run: RunFolder) -> None:
+    report = run.report
+    page.heading("Time and settings")
+    total = report["seconds"].get("total", 0.0)
+    per_frame_ms = 1000.0 / max(run.frames, 1)
+    page.bars(
+        ("stage", "seconds (per frame)"),
+        [
+            (name, value, f"{value:.1f} ({value * per_frame_ms:.0f} ms)")
+            for name, value in report["seconds"].items()
+            if name != "total"
+        ],
+    )
+    page.paragraph(f"{total:.1f} s in all. Stages run side by side, so that their sum may exceed this.", note=True)
+    camera = report["camera"]
+    page.paragraph(
+        f"Camera: {camera['width']}x{camera['height']}, fx {camera['fx']:.2f}, fy {camera['fy']:.2f}, cx "
+        f"{camera['cx']:.2f}, cy {camera['cy']:.2f} px; images: {report['input']['view']}; "
+        f"input {report['input']['path']}."
+    )
+    page.details("All settings", json.dumps(report["configuration"], indent=2))
+    page.details("Versions", json.dumps(report["versions"], indent=2))
+
+
+def _gradient(palette: Palette) -> str:
+    colours = ",".join(f"rgb{tuple(colour.tolist())}" for colour in palette.ramp_strip(12))
+    return f"linear-gradient(90deg,{colours})"

@@ -1,0 +1,45 @@
+"""Frames in, from every format, and the writers that mirror them.
+
+`open_sequence(path)` recognises a recording and delivers grey, undistorted, resized frames with times, depth and
+ground truth. A new format costs one file with one `Recording`, and one row in `opening.FORMATS`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from improvo.sequences.base import Recording, SequenceSettings, SkippedFrame
+    from improvo.sequences.opening import open_recording, open_sequence
+    from improvo.sequences.sequence import Sequence
+    from improvo.sequences.trajectory_files import read_trajectory, write_trajectory
+
+_PUBLIC = {
+    "open_sequence": "opening",
+    "open_recording": "opening",
+    "Sequence": "sequence",
+    "SequenceSettings": "base",
+    "Recording": "base",
+    "SkippedFrame": "base",
+    "read_trajectory": "trajectory_files",
+    "write_trajectory": "trajectory_files",
+}
+
+__all__ = [
+    "Recording",
+    "Sequence",
+    "SequenceSettings",
+    "SkippedFrame",
+    "open_recording",
+    "open_sequence",
+    "read_trajectory",
+    "write_trajectory",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import public names when they are first used, so that importing the room costs nothing."""
+    if name in _PUBLIC:
+        return getattr(importlib.import_module(f"{__name__}.{_PUBLIC[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,83 @@
+"""What a recording is: one capture as it lies on disk, before undistortion, stride and resize."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from improvo.sequences.calibration import Calibration
+from improvo.types import Float32, Float64, Trajectory, UInt8
+
+
+class UnreadableFrameError(Exception):
+    """One frame cannot be decoded; the sequence skips it, counts it and names it."""
+
+
+@dataclass(frozen=True)
+class SequenceSettings:
+    """How a recording is read."""
+
+    format: str = "auto"
+    camera: str | None = None  # a calibration file, or "fx,fy,cx,cy[,k1,k2,p1,p2,k3]"
+    fov: float | None = None  # horizontal field of view in degrees, where nothing better is known
+    fps: float | None = None  # frame rate of recordings without time stamps
+    start: int = 0  # first frame of the recording
+    end: int | None = None  # one past the last frame of the recording
+    stride: int = 1  # every n-th frame
+    max_frames: int | None = None  # after the stride
+    width: int | None = None  # resize to this width, keeping the aspect ratio
+    topic: str | None = None  # the image topic of a ROS bag, or the camera of a recording with several (cam1, image_3)
+
+
+class Recording(ABC):
+    """One recording as it lies on disk, by random access; a format is one file with one subclass.
+
+    The constructor finds out what there is (times, calibration, ground truth) without decoding images. It raises
+    `InputError` where the recording as a whole cannot be used, and adds a line to `notes` for what a user should know.
+    """
+
+    format: ClassVar[str]  # as in --format
+
+    path: Path
+    times: Float64  # (N,) seconds, strictly increasing
+    calibration: Calibration | None = None  # of the raw images, with distortion; None where the format has none
+    ground_truth: Trajectory | None = None  # camera-to-world, rows at their own time stamps
+    notes: tuple[str, ...] = ()  # what was odd but could be handled, one line each
+
+    @abstractmethod
+    def __init__(self, path: Path, settings: SequenceSettings) -> None: ...
+
+    @classmethod
+    @abstractmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether the path looks like this format; cheap, no decoding."""
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @abstractmethod
+    def source(self, index: int) -> str:
+        """Where frame `index` comes from: a file, or "video.mp4#123"."""
+
+    @abstractmethod
+    def image(self, index: int) -> UInt8:
+        """The raw image (H, W) grey or (H, W, 3) BGR.
+
+        Raises:
+            UnreadableFrameError: it cannot be decoded.
+        """
+
+    def depth(self, index: int) -> Float32 | None:
+        """Depth in metres (H, W) registered to the raw image, NaN where missing; None where there is none."""
+        return None
+
+
+@dataclass(frozen=True)
+class SkippedFrame:
+    """A frame that could not be read."""
+
+    index: int  # position in the recording
+    source: str
+    reason: str

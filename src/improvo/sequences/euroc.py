@@ -1,0 +1,138 @@
+"""EuRoC MAV, the ASL layout (Burri et al. 2016): `mav0/cam0/data.csv`, `sensor.yaml`, nanosecond stamps.
+
+Ground truth is that of a body sensor (`state_groundtruth_estimate0`, else `vicon0` or TUM-VI's `mocap0`); the `T_BS` of
+the sensors carry it to the camera. `--topic cam1` chooses another camera. TUM-VI has `dso/camchain.yaml`.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from improvo.errors import InputError
+from improvo.geometry.se3 import inverse
+from improvo.sequences.base import Recording, SequenceSettings
+from improvo.sequences.calibration import Calibration, load_calibration, parse_yaml
+from improvo.sequences.images import list_images, read_image
+from improvo.sequences.trajectory_files import clean_poses, increasing_order, read_trajectory_report
+from improvo.types import Float64, Trajectory, UInt8
+
+_TRUTH = ("state_groundtruth_estimate0", "vicon0", "mocap0")
+
+
+class EurocMav(Recording):
+    """A folder with `mav0`, the `mav0` folder itself, or one of its camera folders."""
+
+    format = "euroc"
+
+    def __init__(self, path: Path, settings: SequenceSettings) -> None:
+        self.path = path
+        root = _mav_folder(path)
+        if root is None:
+            raise InputError(f"{path}: has no mav0/cam0 with images, so it is no EuRoC sequence")
+        name = settings.topic or (path.name if _is_camera(path) else "cam0")
+        folder = root / name
+        if not _is_camera(folder):
+            known = ", ".join(sorted(file.name for file in root.iterdir() if _is_camera(file)))
+            raise InputError(f"{root}: has no camera `{name}`; --topic can be one of {known}")
+        self.times, self._images, notes = _read_images(folder)
+        body_from_cam = np.eye(4)
+        if (folder / "sensor.yaml").is_file():
+            self.calibration = load_calibration(str(folder / "sensor.yaml"))
+            body_from_cam = _body_from_sensor(folder / "sensor.yaml")
+        elif (chain := root.parent / "dso" / "camchain.yaml").is_file():
+            self.calibration, body_from_cam = _from_kalibr_chain(chain, name)
+        for truth in (root / name / "data.csv" for name in _TRUTH):
+            if truth.is_file():
+                world_from_sensor, problems = read_trajectory_report(truth, "euroc")
+                notes += problems
+                sensor = truth.with_name("sensor.yaml")
+                body_from_sensor = _body_from_sensor(sensor) if sensor.is_file() else np.eye(4)
+                poses = world_from_sensor.world_from_cam @ inverse(body_from_sensor) @ body_from_cam
+                self.ground_truth = Trajectory(world_from_sensor.times, poses, world_from_sensor.segment)
+                break
+        self.notes = tuple(notes)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return path.is_dir() and _mav_folder(path) is not None
+
+    def source(self, index: int) -> str:
+        return str(self._images[index])
+
+    def image(self, index: int) -> UInt8:
+        return read_image(self._images[index])
+
+
+def _mav_folder(path: Path) -> Path | None:
+    if _is_camera(path) and path.absolute().parent.name == "mav0":
+        return path.absolute().parent
+    for folder in (path / "mav0", path):
+        if _is_camera(folder / "cam0") or _is_camera(folder / "cam1"):
+            return folder
+    return None
+
+
+def _is_camera(folder: Path) -> bool:
+    return (folder / "data").is_dir() and re.fullmatch(r"cam\d+", folder.name) is not None
+
+
+def _read_images(folder: Path) -> tuple[Float64, list[Path], list[str]]:
+    """Times and files of `data.csv`; without it, those that the file names say."""
+    table = folder / "data.csv"
+    rows, bad = [], 0
+    if table.is_file():
+        try:
+            lines = table.read_text(encoding="utf-8").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{table}: cannot be read ({error}); copy it again") from None
+        for line in lines:
+            fields = [field.strip() for field in line.split(",")]
+            if not line.strip() or line.startswith("#"):
+                continue
+            if len(fields) >= 2 and re.fullmatch(r"\d{1,19}", fields[0]) and fields[1]:
+                rows.append((int(fields[0]), folder / "data" / fields[1]))
+            else:
+                bad += 1
+    else:
+        files = list_images(folder / "data")
+        rows = [(int(file.stem), file) for file in files if re.fullmatch(r"\d{1,19}", file.stem)]
+    if not rows:
+        raise InputError(f"{table}: has no row `timestamp [ns],filename`; repair it")
+    stamps = np.array([stamp for stamp, _ in rows], np.int64)
+    order, repeated = increasing_order(stamps / 1e9)
+    notes = [f"{table}: {bad} rows are not `timestamp,filename` and were left out"] if bad else []
+    notes += [f"{table}: {repeated} rows repeat a time stamp and were left out"] if repeated else []
+    return stamps[order] / 1e9, [rows[row][1] for row in order], notes
+
+
+def _body_from_sensor(path: Path) -> Float64:
+    """T_BS of a `sensor.yaml`, the identity where it has none.
+
+    Raises:
+        InputError: not a rigid motion.
+    """
+    content = parse_yaml(path.read_text(encoding="utf-8", errors="replace"), path)
+    matrix = content.get("T_BS", {"data": np.eye(4).ravel().tolist()})
+    return _rigid(matrix.get("data") if isinstance(matrix, dict) else matrix, path, "T_BS")
+
+
+def _from_kalibr_chain(path: Path, camera: str) -> tuple[Calibration, Float64]:
+    content = parse_yaml(path.read_text(encoding="utf-8", errors="replace"), path)
+    entry = content.get(camera)
+    matrix = entry.get("T_cam_imu") if isinstance(entry, dict) else None
+    cam_from_body = np.eye(4) if matrix is None else _rigid(matrix, path, "T_cam_imu")
+    return load_calibration(str(path), camera), inverse(cam_from_body)
+
+
+def _rigid(values: object, path: Path, name: str) -> Float64:
+    try:
+        matrix = np.array(values, np.float64).reshape(1, 4, 4)
+    except (TypeError, ValueError):
+        matrix = np.full((1, 4, 4), np.nan)
+    pose = clean_poses(matrix)[0][0]
+    if not np.isfinite(pose).all():
+        raise InputError(f"{path}: {name} is no rigid 4x4 motion; repair it")
+    return pose

@@ -1,0 +1,90 @@
+"""ICL-NUIM (Handa et al. 2014), "TUM RGB-D compatible PNGs": `associations.txt`, `rgb`, `depth`, `*.gt.freiburg`.
+
+Time stamps are frame numbers at 30 Hz. The published poses are those of a camera whose y axis points up, as the
+negative fy of its intrinsics says; they are reflected here, so that K is ordinary and rotations stay rotations.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from improvo.errors import InputError
+from improvo.sequences.base import Recording, SequenceSettings
+from improvo.sequences.calibration import Calibration, folder_calibration
+from improvo.sequences.images import list_images, read_depth, read_image
+from improvo.sequences.trajectory_files import read_trajectory_report
+from improvo.types import Float32, Trajectory, UInt8
+
+DEPTH_SCALE = 5000.0
+FPS = 30.0
+_UP_TO_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+class IclNuim(Recording):
+    """A folder with `rgb`, `depth` and a `*.gt.freiburg` file."""
+
+    format = "icl"
+
+    def __init__(self, path: Path, settings: SequenceSettings) -> None:
+        self.path = path
+        frames = _associations(path)
+        if not frames:
+            raise InputError(f"{path}: has no rgb images named by their frame numbers; unpack the archive again")
+        self._numbers = sorted(frames)
+        self._images = [frames[number][0] for number in self._numbers]
+        self._depth = [frames[number][1] for number in self._numbers]
+        rate = settings.fps or FPS
+        self.times = np.array(self._numbers, np.float64) / rate
+        self.calibration = folder_calibration(path) or Calibration(
+            "ICL-NUIM", (481.2, 480.0, 319.5, 239.5), size=(640, 480)
+        )
+        self._scale = self.calibration.depth_scale or DEPTH_SCALE
+        truth = next(iter(sorted(path.glob("*.gt.freiburg"))), None)
+        if truth is not None:
+            published, self.notes = read_trajectory_report(truth, "tum")
+            poses = _UP_TO_DOWN @ published.world_from_cam @ _UP_TO_DOWN
+            self.ground_truth = Trajectory(published.times / rate, poses)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return path.is_dir() and (path / "rgb").is_dir() and any(path.glob("*.gt.freiburg"))
+
+    def source(self, index: int) -> str:
+        return str(self._images[index])
+
+    def image(self, index: int) -> UInt8:
+        return read_image(self._images[index])
+
+    def depth(self, index: int) -> Float32 | None:
+        file = self._depth[index]
+        return read_depth(file, self._scale) if file is not None and file.is_file() else None
+
+
+def _associations(path: Path) -> dict[int, tuple[Path, Path | None]]:
+    """Frame number -> image and depth, by `associations.txt` or, without it, by the file names."""
+    table = path / "associations.txt"
+    frames: dict[int, tuple[Path, Path | None]] = {}
+    if table.is_file():
+        for line in table.read_text(encoding="utf-8", errors="replace").splitlines():
+            fields = line.split()
+            if len(fields) < 4 or line.startswith("#"):
+                continue
+            # either pair may come first: rows are "number file number file"
+            pair = {Path(name).parts[0]: (number, name) for number, name in (fields[:2], fields[2:4])}
+            if "rgb" in pair and _is_number(pair["rgb"][0]):
+                depth = path / pair["depth"][1] if "depth" in pair else None
+                frames[int(float(pair["rgb"][0]))] = (path / pair["rgb"][1], depth)
+    if not frames:
+        for file in list_images(path / "rgb"):
+            if file.stem.isdigit():
+                frames[int(file.stem)] = (file, path / "depth" / f"{file.stem}.png")
+    return frames
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return np.isfinite(float(text)) and 0 <= float(text) < 1e12
+    except ValueError:
+        return False

@@ -1,0 +1,111 @@
+"""KITTI odometry (Geiger et al. 2012): `calib.txt`, `times.txt`, `image_0` (grey) or `image_2` (colour), poses.
+
+Poses are those of camera 0: `poses.txt` in the folder, or `poses/NN.txt` beside the `sequences` folder. Images of
+another camera get its place from the projection matrix, which is K [I | t].
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from improvo.errors import InputError
+from improvo.geometry.se3 import inverse, rigid
+from improvo.sequences.base import Recording, SequenceSettings
+from improvo.sequences.calibration import Calibration, folder_calibration
+from improvo.sequences.images import list_images, read_image
+from improvo.sequences.trajectory_files import increasing_order, read_times, read_trajectory_report
+from improvo.types import Float64, Trajectory, UInt8
+
+FPS = 10.0
+_CAMERAS = (0, 2, 1, 3)
+
+
+class KittiOdometry(Recording):
+    """A folder with `calib.txt` and `image_0` or `image_2`."""
+
+    format = "kitti"
+
+    def __init__(self, path: Path, settings: SequenceSettings) -> None:
+        self.path = path
+        number = next((n for n in _CAMERAS if _has_images(path / f"image_{n}")), None)
+        if number is None:
+            raise InputError(f"{path}: has no images in image_0 or image_2, so it is no KITTI odometry sequence")
+        self._images = list_images(path / f"image_{number}")
+        notes: list[str] = []
+        order = np.arange(len(self._images))
+        if (path / "times.txt").is_file() and settings.fps is None:
+            times = read_times(path / "times.txt")
+            if len(times) < len(self._images):
+                counts = f"{len(times)} times for {len(self._images)} images"
+                raise InputError(f"{path / 'times.txt'}: has {counts}; repair it or give --fps")
+            if len(times) > len(self._images):
+                notes.append(f"{path}: {len(times) - len(self._images)} of {len(times)} images are missing at the end")
+            times = times[: len(self._images)]
+            order, repeated = increasing_order(times)
+            notes += [f"{path}: {repeated} images repeat a time stamp and were left out"] if repeated else []
+        else:
+            times = order / (settings.fps or FPS)
+        self._images, self.times = [self._images[row] for row in order], times[order]
+        cam_from_cam0 = np.eye(4)
+        self.calibration = folder_calibration(path)
+        if (path / "calib.txt").is_file():
+            calibration, cam_from_cam0 = _read_calibration(path / "calib.txt", number)
+            self.calibration = self.calibration or calibration
+        poses_file = next((file for file in _pose_files(path) if file.is_file()), None)
+        if poses_file is not None:
+            self.ground_truth, problems = _read_poses(poses_file, times, cam_from_cam0)
+            notes += problems
+        self.notes = tuple(notes)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return (path / "calib.txt").is_file() and any(_has_images(path / f"image_{n}") for n in _CAMERAS)
+
+    def source(self, index: int) -> str:
+        return str(self._images[index])
+
+    def image(self, index: int) -> UInt8:
+        return read_image(self._images[index])
+
+
+def _has_images(folder: Path) -> bool:
+    return folder.is_dir() and bool(list_images(folder))
+
+
+def _pose_files(path: Path) -> tuple[Path, ...]:
+    absolute = path.absolute()
+    return (path / "poses.txt", path / "groundtruth.txt", absolute.parent.parent / "poses" / f"{absolute.name}.txt")
+
+
+def _read_calibration(path: Path, number: int) -> tuple[Calibration, Float64]:
+    """The calibration of camera `number`, and cam_from_cam0 (4, 4)."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        rows = {line.split(":")[0].strip(): line.split(":", 1)[1].split() for line in lines if ":" in line}
+        projection = np.array(rows[f"P{number}"], np.float64).reshape(3, 4)
+        cam_from_cam0 = rigid(np.eye(3), np.linalg.solve(projection[:, :3], projection[:, 3]).astype(np.float64))
+    except (OSError, UnicodeDecodeError, KeyError, ValueError, np.linalg.LinAlgError):
+        raise InputError(f"{path}: has no row `P{number}:` with 12 numbers; repair it or give --camera") from None
+    fx, fy, cx, cy = (float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    calibration = Calibration(str(path), (fx, fy, cx, cy))
+    calibration.camera(1, 1)
+    return calibration, cam_from_cam0
+
+
+def _read_poses(path: Path, times: Float64, cam_from_cam0: Float64) -> tuple[Trajectory, tuple[str, ...]]:
+    """Poses of the images' camera in camera 0's first frame."""
+    world_from_cam0, problems = read_trajectory_report(path, times=_at_least(times, path))
+    if (cam_from_cam0 == np.eye(4)).all():
+        return world_from_cam0, problems
+    poses = world_from_cam0.world_from_cam @ inverse(cam_from_cam0)
+    return Trajectory(world_from_cam0.times, poses, world_from_cam0.segment), problems
+
+
+def _at_least(times: Float64, path: Path) -> Float64:
+    """The images' times, continued where there are more poses than images (a shortened copy)."""
+    count = sum(1 for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip())
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 1 / FPS
+    extra = max(0, count - len(times))
+    return np.concatenate([times, times[-1] + step * np.arange(1, extra + 1)])

@@ -1,0 +1,121 @@
+"""Nerfstudio's and instant-ngp's `transforms.json`: images with intrinsics and OpenGL camera poses.
+
+Frames are in the order of their file names' numbers. Principal points count from the corner of the pixel, as in COLMAP,
+and are moved by half a pixel. Depth images are 16 bit, in units of `depth_unit_scale_factor` metres (default 0.001).
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from improvo.errors import InputError
+from improvo.sequences.base import Recording, SequenceSettings
+from improvo.sequences.calibration import Calibration
+from improvo.sequences.image_folder import frame_rate
+from improvo.sequences.images import natural_key, read_depth, read_image
+from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
+from improvo.types import Float32, Float64, UInt8
+
+_BROWN = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
+
+
+class Nerfstudio(Recording):
+    """A folder with `transforms.json`, or that file."""
+
+    format = "nerfstudio"
+
+    def __init__(self, path: Path, settings: SequenceSettings) -> None:
+        self.path = path
+        file = path / "transforms.json" if path.is_dir() else path
+        content = read_json(file)
+        frames = content.get("frames")
+        frames = [f for f in frames if isinstance(f, dict) and f.get("file_path")] if isinstance(frames, list) else []
+        if not frames:
+            raise InputError(f"{file}: lists no frames with a file_path; export it again")
+        frames.sort(key=lambda frame: natural_key(str(frame["file_path"])))
+        self._images = [_file(file.parent, str(frame["file_path"])) for frame in frames]
+        self._depth = [frame.get("depth_file_path") for frame in frames]
+        self._folder = file.parent
+        unit = numbers(content.get("depth_unit_scale_factor", 0.001), 1)[0]
+        self._scale = 1 / unit if unit > 0 else 1000.0
+        notes: list[str] = []
+        self.calibration = None
+        calibrated = _calibration(str(file), content, frames)
+        if calibrated is not None:
+            self.calibration, notes = calibrated
+        rate, note = frame_rate(None, settings)
+        notes += [f"{path}: {note}"] if note else []
+        self.times = np.arange(len(frames)) / rate
+        poses = np.stack([numbers(frame.get("transform_matrix"), 16).reshape(4, 4) for frame in frames])
+        self.ground_truth, problems = trajectory_from_opengl(str(file), self.times, poses)
+        self.notes = (*notes, *problems)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return path.name == "transforms.json" or (path / "transforms.json").is_file()
+
+    def source(self, index: int) -> str:
+        return str(self._images[index])
+
+    def image(self, index: int) -> UInt8:
+        return read_image(self._images[index])
+
+    def depth(self, index: int) -> Float32 | None:
+        name = self._depth[index]
+        if not name:
+            return None
+        depth = read_depth(self._folder / str(name), self._scale)
+        assert self.calibration is not None
+        size = self.calibration.size
+        if size is not None and depth.shape != (size[1], size[0]):
+            return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
+        return depth
+
+
+def _file(folder: Path, name: str) -> Path:
+    """The image; names without an ending mean PNG, as in NeRF's synthetic scenes."""
+    return folder / name if Path(name).suffix else folder / f"{name}.png"
+
+
+def _calibration(
+    source: str, content: dict[str, Any], frames: list[dict[str, Any]]
+) -> tuple[Calibration, list[str]] | None:
+    """Intrinsics of all frames, those of the whole file where a frame has none; None where neither has any."""
+    size_numbers = numbers([_value(frames[0], content, "w"), _value(frames[0], content, "h")], 2)
+    size = None
+    if np.isfinite(size_numbers).all() and (size_numbers >= 1).all():
+        size = (int(size_numbers[0]), int(size_numbers[1]))
+    rows = np.stack([_intrinsics(frame, content, size) for frame in frames])
+    if not np.isfinite(rows).all(axis=1).any():
+        return None
+    model = str(content.get("camera_model", "OPENCV")).upper()
+    names = ("k1", "k2", "k3", "k4") if model == "OPENCV_FISHEYE" else ("k1", "k2", "p1", "p2", "k3")
+    if model != "OPENCV_FISHEYE" and model not in _BROWN:
+        raise InputError(f"{source}: camera_model {model} is not supported; undistort the images, or give --camera")
+    values = tuple(float(_value(frames[0], content, name) or 0.0) for name in names)
+    fisheye = model == "OPENCV_FISHEYE"
+    distortion = values if fisheye or any(values) else ()
+    return median_calibration(source, rows, distortion, "fisheye" if fisheye else "brown", size)
+
+
+def _intrinsics(frame: dict[str, Any], content: dict[str, Any], size: tuple[int, int] | None) -> Float64:
+    """fx, fy, cx, cy of one frame, the centre of the top-left pixel at (0, 0)."""
+    values = [_value(frame, content, name) for name in ("fl_x", "fl_y", "cx", "cy")]
+    angle = numbers(_value(frame, content, "camera_angle_x"), 1)[0]
+    if values[0] is None and size is not None and 0 < angle < math.pi:
+        values[0] = 0.5 * size[0] / math.tan(angle / 2)
+    if values[1] is None:
+        values[1] = values[0]
+    if size is not None:
+        values[2] = size[0] / 2 if values[2] is None else values[2]
+        values[3] = size[1] / 2 if values[3] is None else values[3]
+    return numbers(values, 4) - [0.0, 0.0, 0.5, 0.5]
+
+
+def _value(frame: dict[str, Any], content: dict[str, Any], name: str) -> Any:
+    return frame.get(name, content.get(name))

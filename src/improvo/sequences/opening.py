@@ -1,0 +1,129 @@
+"""`open_sequence`: which format a path is, and the sequence it makes."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+from improvo.errors import ConfigError, InputError
+from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
+from improvo.sequences.live import LiveStream, is_live
+from improvo.sequences.live_sequence import LiveSequence
+from improvo.sequences.sequence import Sequence
+
+ENTRY_POINT = "improvo.recordings"  # the group under which other packages offer their readers
+
+# format -> class; the most telling layouts first, the plain image folder last
+FORMATS: dict[str, str] = {
+    "live": "improvo.sequences.live:LiveStream",
+    "sens": "improvo.sequences.scannet_sens:ScanNetSens",
+    "rosbag": "improvo.sequences.ros_bag:RosBag",
+    "record3d": "improvo.sequences.record3d:Record3d",
+    "nerfstudio": "improvo.sequences.nerfstudio:Nerfstudio",
+    "polycam": "improvo.sequences.polycam:Polycam",
+    "scannet": "improvo.sequences.scannet_folder:ScanNetFolder",
+    "7scenes": "improvo.sequences.seven_scenes:SevenScenes",
+    "icl": "improvo.sequences.icl_nuim:IclNuim",
+    "tum": "improvo.sequences.tum_rgbd:TumRgbd",
+    "euroc": "improvo.sequences.euroc:EurocMav",
+    "kitti": "improvo.sequences.kitti_odometry:KittiOdometry",
+    "video": "improvo.sequences.video_file:VideoFile",
+    "images": "improvo.sequences.image_folder:ImageFolder",
+}
+
+
+def open_sequence(path: Path | str, settings: SequenceSettings | None = None, **overrides: Any) -> Sequence:
+    """Open any recording by its path.
+
+    Args:
+        path: a video file, an image folder, a data set, a bag, the number of a webcam, or the address of a stream.
+        settings: how to read it; keyword arguments replace single fields (`stride=2`, `camera="camera.yaml"`).
+
+    Raises:
+        InputError: no such path, an unknown layout, no calibration or one for another image size, no readable frame.
+        ConfigError: an unknown setting or format.
+    """
+    settings = _with_overrides(settings, overrides)
+    recording = open_recording(path, settings)
+    if isinstance(recording, LiveStream):
+        return LiveSequence(recording, settings)
+    return Sequence(recording, settings)
+
+
+def open_recording(path: Path | str, settings: SequenceSettings | None = None, **overrides: Any) -> Recording:
+    """The recording as it lies on disk: raw images, needs no calibration. Arguments and errors as `open_sequence`."""
+    settings = _with_overrides(settings, overrides)
+    path = Path(path)
+    if settings.fps is not None and not settings.fps > 0:
+        raise InputError(f"{path}: fps {settings.fps:g} must be positive")
+    live = is_live(str(path))
+    if not live and not path.exists():
+        raise InputError(f"{path}: no such file or folder; check the path")
+    if path.is_dir() and not any(path.iterdir()):
+        raise InputError(f"{path}: the folder is empty; give a video, an image folder or a data set")
+    if settings.format == "auto":
+        chosen = next((recording for recording in _formats() if recording.recognises(path)), None)
+        if chosen is None:
+            raise InputError(
+                f"{path}: not recognised as any of {', '.join(format_names())}; name it with --format if it is one"
+            )
+    else:
+        chosen = _format(settings.format)
+    try:
+        return chosen(path, settings)
+    except UnreadableFrameError as error:
+        raise InputError(f"{path}: {error}; copy or export the recording again") from None
+    except OSError as error:
+        raise InputError(
+            f"{error.filename or path}: {error.strerror or error}; check the path and permissions"
+        ) from None
+
+
+def format_names() -> list[str]:
+    """The names for --format, `auto` left out: our own and those of installed readers."""
+    return [*_installed(), *FORMATS]
+
+
+def _formats() -> Iterator[type[Recording]]:
+    """Installed readers first, so that they can take over a layout of ours."""
+    for name in format_names():
+        yield _format(name)
+
+
+def _format(name: str) -> type[Recording]:
+    installed = _installed()
+    if name in installed:
+        try:
+            return _checked(installed[name].load(), installed[name].value)
+        except (ImportError, AttributeError) as error:
+            raise InputError(f"reader `{name}` ({installed[name].value}) cannot be imported: {error}") from None
+    if name not in FORMATS:
+        raise ConfigError(f"--format {name}: unknown; known: auto, {', '.join(format_names())}")
+    module, _, attribute = FORMATS[name].partition(":")
+    recording: type[Recording] = getattr(importlib.import_module(module), attribute)
+    return recording
+
+
+def _installed() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=ENTRY_POINT)}
+
+
+def _checked(reader: Any, where: str) -> type[Recording]:
+    if not (isinstance(reader, type) and issubclass(reader, Recording)):
+        raise InputError(f"reader {where}: must be a subclass of improvo.sequences.Recording; see docs/recordings.md")
+    return reader
+
+
+def _with_overrides(settings: SequenceSettings | None, overrides: dict[str, Any]) -> SequenceSettings:
+    settings = settings or SequenceSettings()
+    try:
+        settings = replace(settings, **overrides)
+    except TypeError:
+        known = ", ".join(SequenceSettings.__dataclass_fields__)
+        unknown = ", ".join(name for name in overrides if name not in SequenceSettings.__dataclass_fields__)
+        raise ConfigError(f"unknown sequence setting {unknown}; known: {known}") from None
+    return settings if settings.camera is None else replace(settings, camera=str(settings.camera))

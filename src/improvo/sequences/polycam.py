@@ -1,0 +1,86 @@
+"""Polycam's raw export: `keyframes/images`, `cameras` (one JSON a frame), `depth` in millimetres.
+
+The optimised `corrected_images` and `corrected_cameras` are used where they are. Time stamps are taken as microseconds.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from improvo.errors import InputError
+from improvo.sequences.base import Recording, SequenceSettings
+from improvo.sequences.images import list_images, read_depth, read_image
+from improvo.sequences.trajectory_files import increasing_order
+from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
+from improvo.types import Float32, UInt8
+
+DEPTH_SCALE = 1000.0
+FPS = 10.0
+_POSE = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
+
+
+class Polycam(Recording):
+    """The export's folder, or its `keyframes`."""
+
+    format = "polycam"
+
+    def __init__(self, path: Path, settings: SequenceSettings) -> None:
+        self.path = path
+        folder = path / "keyframes" if (path / "keyframes").is_dir() else path
+        prefix = (
+            "corrected_" if (folder / "corrected_cameras").is_dir() and (folder / "corrected_images").is_dir() else ""
+        )
+        images = {file.stem: file for file in list_images(folder / f"{prefix}images")}
+        names = [name for name in images if (folder / f"{prefix}cameras" / f"{name}.json").is_file()]
+        if not names:
+            raise InputError(f"{folder}: no image has a camera file beside it; export the raw data again")
+        without = len(images) - len(names)
+        notes = (
+            [f"{folder}: {without} of {len(images)} images have no camera file and were left out"] if without else []
+        )
+        cameras = [read_json(folder / f"{prefix}cameras" / f"{name}.json") for name in names]
+        stamps = np.array([numbers(camera.get("timestamp"), 1)[0] for camera in cameras]) / 1e6
+        if settings.fps is None and np.isfinite(stamps).all():
+            order, repeated = increasing_order(stamps)
+            notes += [f"{folder}: {repeated} images repeat a time stamp and were left out"] if repeated else []
+            names, cameras = [names[row] for row in order], [cameras[row] for row in order]
+            self.times = stamps[order]
+        else:
+            self.times = np.arange(len(names)) / (settings.fps or FPS)
+        self._images = [images[name] for name in names]
+        self._depth = [folder / "depth" / f"{name}.png" for name in names]
+        size_numbers = numbers([cameras[0].get("width"), cameras[0].get("height")], 2)
+        size = (int(size_numbers[0]), int(size_numbers[1])) if (size_numbers >= 1).all() else None
+        intrinsics = np.stack([numbers([c.get(key) for key in ("fx", "fy", "cx", "cy")], 4) for c in cameras])
+        self.calibration, more = median_calibration(str(folder / f"{prefix}cameras"), intrinsics, size=size)
+        last_row = np.tile([[0.0, 0.0, 0.0, 1.0]], (len(names), 1))
+        rows = np.stack([numbers([camera.get(key) for key in _POSE], 12) for camera in cameras])
+        poses = np.concatenate([rows, last_row], axis=1).reshape(-1, 4, 4)
+        self.ground_truth, problems = trajectory_from_opengl(str(folder), self.times, poses)
+        self.notes = (*notes, *more, *problems)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return any(
+            (folder / "cameras").is_dir() and (folder / "images").is_dir() for folder in (path / "keyframes", path)
+        )
+
+    def source(self, index: int) -> str:
+        return str(self._images[index])
+
+    def image(self, index: int) -> UInt8:
+        return read_image(self._images[index])
+
+    def depth(self, index: int) -> Float32 | None:
+        """The depth image shows the same view at a lower resolution; each pixel looks up the nearest."""
+        file = self._depth[index]
+        if not file.is_file():
+            return None
+        depth = read_depth(file, DEPTH_SCALE)
+        size = self.calibration.size if self.calibration is not None else None
+        if size is not None and depth.shape != (size[1], size[0]):
+            return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
+        return depth

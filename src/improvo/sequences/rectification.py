@@ -1,0 +1,126 @@
+"""From raw images to the pinhole view that is delivered: undistorted once, then resized; depth goes the same way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from improvo.errors import InputError
+from improvo.geometry.camera import Camera
+from improvo.types import Float32, Float64, UInt8
+
+_ZOOM_LIMITS = (1 / 64, 8.0)
+
+
+class Rectifier:
+    """Carries raw images and depth of one camera to a pinhole camera of the same or another width.
+
+    A distorted camera gets the widest pinhole view of the raw size, pixel shape and principal point that shows no
+    border: its focal lengths are the raw ones times `zoom`. What the view leaves out is said by `description`.
+    """
+
+    def __init__(self, raw: Camera, width: int | None = None) -> None:
+        self.raw = raw
+        self.zoom = 1.0
+        self._maps: tuple[Float32, Float32] | None = None
+        view = raw.pinhole()
+        if not raw.is_pinhole:
+            self.zoom = _widest_zoom(raw)
+            view = replace(view, fx=raw.fx * self.zoom, fy=raw.fy * self.zoom)
+            self._maps = _maps(raw, view)
+        self._undistorted = view
+        if width is not None and width != view.width:
+            view = view.resized(width, max(1, round(view.height * width / view.width)))
+        self.camera = view
+
+    @property
+    def description(self) -> str:
+        """What was done, for a person: the crop of the undistortion and the resize."""
+        parts = []
+        if self._maps is not None:
+            parts.append(
+                f"undistorted ({self.raw.distortion_model}) to a {self._undistorted.width}x{self._undistorted.height} "
+                f"pinhole, focal length x {self.zoom:.3f}, {100 * self._share_kept():.0f} % of the raw picture kept"
+            )
+        if (self.camera.width, self.camera.height) != (self.raw.width, self.raw.height):
+            parts.append(f"resized to {self.camera.width}x{self.camera.height}")
+        return ", ".join(parts) or "as recorded"
+
+    def image(self, grey: UInt8) -> UInt8:
+        """Raw grey (H, W) -> delivered grey; sampling bilinear, shrinking by pixel area."""
+        if self._maps is not None:
+            grey = cv2.remap(grey, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        size = (self.camera.width, self.camera.height)
+        if size != (grey.shape[1], grey.shape[0]):
+            shrinks = size[0] < grey.shape[1]
+            grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        return np.ascontiguousarray(grey)
+
+    def depth(self, depth: Float32) -> Float32:
+        """Raw depth (H, W) -> depth of the delivered frame by nearest pixel, so that edges are not mixed."""
+        if self._maps is not None:
+            depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
+        size = (self.camera.width, self.camera.height)
+        if size != (depth.shape[1], depth.shape[0]):
+            depth = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
+        return np.ascontiguousarray(depth)
+
+    def _share_kept(self) -> float:
+        """Area of the raw picture that the view shows, as a share."""
+        contour = _distort_pixels(self.raw, self._undistorted, _border(self.raw.width, self.raw.height))
+        x, y = contour[:, 0], contour[:, 1]
+        area = 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
+        return float(area / ((self.raw.width - 1) * (self.raw.height - 1) or 1))
+
+
+def _widest_zoom(raw: Camera) -> float:
+    """The smallest factor on the focal lengths at which every pixel of the view lies within the raw picture."""
+    narrow, wide = _ZOOM_LIMITS[1], _ZOOM_LIMITS[0]
+    border = _border(raw.width, raw.height)
+    if not _inside(raw, narrow, border):
+        size = f"{raw.width}x{raw.height}"
+        raise InputError(f"distortion {raw.distortion} of the {size} camera cannot be undone; check the calibration")
+    # from narrow to wide, so that a polynomial that folds back far outside is never reached
+    zoom = narrow
+    while zoom / 1.05 >= wide and _inside(raw, zoom / 1.05, border):
+        zoom /= 1.05
+    low, high = zoom / 1.05, zoom
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if _inside(raw, middle, border) else (middle, high)
+    return high
+
+
+def _inside(raw: Camera, zoom: float, border: Float64) -> bool:
+    view = replace(raw.pinhole(), fx=raw.fx * zoom, fy=raw.fy * zoom)
+    pixels = _distort_pixels(raw, view, border)
+    rays = view.unproject(border)[:, :2]
+    # a ray a little further out must land further out: beyond that the polynomial is no camera any more
+    further = raw.distort(rays * 1.001)
+    here = raw.distort(rays)
+    grows = (further**2).sum(axis=1) >= (here**2).sum(axis=1)
+    limit = np.array([raw.width - 1, raw.height - 1]) + 1e-6
+    return bool(np.isfinite(pixels).all() and (pixels >= -1e-6).all() and (pixels <= limit).all() and grows.all())
+
+
+def _distort_pixels(raw: Camera, view: Camera, pixels: Float64) -> Float64:
+    """Pixels (..., 2) of the pinhole view -> pixels of the raw image."""
+    distorted = raw.distort(view.unproject(pixels)[..., :2])
+    return np.asarray(distorted * [raw.fx, raw.fy] + [raw.cx, raw.cy])
+
+
+def _maps(raw: Camera, view: Camera) -> tuple[Float32, Float32]:
+    x, y = np.meshgrid(np.arange(view.width, dtype=np.float64), np.arange(view.height, dtype=np.float64))
+    pixels = _distort_pixels(raw, view, np.stack([x, y], axis=-1)).astype(np.float32)
+    return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
+
+
+def _border(width: int, height: int) -> Float64:
+    """Pixels (N, 2) round the edge of a picture, in order."""
+    x, y = np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)
+    top, bottom = np.zeros_like(x), np.full_like(x, height - 1)
+    left, right = np.zeros_like(y), np.full_like(y, width - 1)
+    sides = [(x, top), (right, y), (x[::-1], bottom), (left, y[::-1])]
+    return np.concatenate([np.stack(side, axis=-1) for side in sides])

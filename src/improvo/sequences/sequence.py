@@ -1,0 +1,209 @@
+"""The sequence of frames that the rest of improvo sees: grey, undistorted, resized, every n-th."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from improvo.errors import InputError
+from improvo.geometry.camera import Camera
+from improvo.sequences.association import poses_at
+from improvo.sequences.base import Recording, SequenceSettings, SkippedFrame, UnreadableFrameError
+from improvo.sequences.calibration import Calibration, from_field_of_view, load_calibration
+from improvo.sequences.images import grey
+from improvo.sequences.rectification import Rectifier
+from improvo.types import Float32, Float64, Frame, Int64, Trajectory, UInt8
+
+_PROBES = 20  # frames tried for the image size before a recording counts as unreadable
+
+
+class Sequence:
+    """Frames of a recording as delivered: iterate, or take `sequence[i]`; both give the same frames.
+
+    Row i of `times`, `depth(i)` and `ground_truth` is the i-th selected frame of the recording (after start, end,
+    stride and max_frames). Iteration leaves out frames that cannot be decoded and lists them in `skipped`; `row(frame)`
+    gives the row of a frame that came out.
+
+    Raises:
+        InputError: no calibration, one for another image size, no readable frame, or an empty selection.
+    """
+
+    def __init__(self, recording: Recording, settings: SequenceSettings) -> None:
+        self.indices = _selected(recording, settings)  # (N,) rows of the recording
+        height, width = _probe(recording, self.indices).shape[:2]
+        self._set_up(recording, settings, width, height)
+
+    def _set_up(self, recording: Recording, settings: SequenceSettings, width: int, height: int) -> None:
+        """Everything that follows from the size of the raw images."""
+        self.recording = recording
+        self.settings = settings
+        self.path: Path = recording.path
+        self.format = recording.format
+        self.name = _name(recording.path)
+        self._skipped: dict[int, SkippedFrame] = {}
+        self._raw_size = (width, height)
+        if settings.width is not None and settings.width < 8:
+            raise InputError(f"{self.path}: width {settings.width} is too small; choose at least 8 pixels")
+        calibration = _calibration(recording, settings, width, height)
+        self._rectifier = Rectifier(calibration.camera(width, height), settings.width)
+
+    @property
+    def camera(self) -> Camera:
+        """The pinhole camera of the frames as delivered."""
+        return self._rectifier.camera
+
+    @property
+    def raw_camera(self) -> Camera:
+        """The camera of the recording's own images, with distortion."""
+        return self._rectifier.raw
+
+    @property
+    def view(self) -> str:
+        """What was done to the images, for a person: undistortion with its crop, resize."""
+        return self._rectifier.description
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was odd in the recording but could be handled, one line each."""
+        return self.recording.notes
+
+    @property
+    def skipped(self) -> list[SkippedFrame]:
+        """Frames that could not be read so far, in the recording's order."""
+        return [self._skipped[index] for index in sorted(self._skipped)]
+
+    @cached_property
+    def times(self) -> Float64:
+        """(N,) seconds of the selected frames, the recording's own clock."""
+        return self.recording.times[self.indices]
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:
+        """Camera-to-world at `times`, one row per selected frame, NaN where there is no pose; None without any."""
+        truth = self.recording.ground_truth
+        return None if truth is None else poses_at(truth, self.times)
+
+    @property
+    def length(self) -> int | None:
+        """The number of selected frames; None where it is not known, because the recording is still going on."""
+        return len(self.indices)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, i: int) -> Frame:
+        """The i-th selected frame.
+
+        Raises:
+            IndexError: there is no such row.
+            InputError: the frame cannot be decoded.
+        """
+        index = int(self.indices[i])
+        frame = self._frame(index)
+        if frame is None:
+            raise InputError(f"{self.recording.source(index)}: {self._skipped[index].reason}; leave this frame out")
+        return frame
+
+    def __iter__(self) -> Iterator[Frame]:
+        for index in self.indices:
+            frame = self._frame(int(index))
+            if frame is not None:
+                yield frame
+
+    def row(self, frame: Frame) -> int:
+        """The row of a delivered frame in `times` and `ground_truth`, and the argument of `depth` for it."""
+        return int(np.searchsorted(self.indices, frame.index))
+
+    def depth(self, i: int) -> Float32 | None:
+        """Depth in metres (H, W) of the i-th selected frame, same geometry as its image, NaN where missing.
+
+        None where the recording has none for this frame or it cannot be decoded.
+        """
+        index = int(self.indices[i])
+        try:
+            depth = self.recording.depth(index)
+        except UnreadableFrameError:
+            return None
+        if depth is None or (depth.shape[1], depth.shape[0]) != self._raw_size:
+            return None
+        return self._rectifier.depth(depth)
+
+    def _frame(self, index: int) -> Frame | None:
+        source = self.recording.source(index)
+        try:
+            image = grey(self._raw_image(index))
+        except UnreadableFrameError as error:
+            self._skipped[index] = SkippedFrame(index, source, str(error))
+            return None
+        return Frame(index, float(self.recording.times[index]), self._rectifier.image(image), source)
+
+    def _raw_image(self, index: int) -> UInt8:
+        image = self.recording.image(index)
+        size = (image.shape[1], image.shape[0])
+        if size != self._raw_size:
+            first = f"{self._raw_size[0]}x{self._raw_size[1]}"
+            raise UnreadableFrameError(f"is {size[0]}x{size[1]} in a recording of {first}")
+        return image
+
+
+def _probe(recording: Recording, indices: Int64) -> UInt8:
+    """The first readable image, for its size."""
+    reasons = []
+    for index in indices[:_PROBES].tolist():
+        image, reason = _image_or_reason(recording, index)
+        if image is not None:
+            return image
+        reasons.append(f"{recording.source(index)}: {reason}")
+    raise InputError(f"{recording.path}: none of the first frames can be read ({reasons[0]}); check the recording")
+
+
+def _image_or_reason(recording: Recording, index: int) -> tuple[UInt8 | None, str]:
+    try:
+        return recording.image(index), ""
+    except UnreadableFrameError as error:
+        return None, str(error)
+
+
+def _selected(recording: Recording, settings: SequenceSettings) -> Int64:
+    """The recording's rows that the settings ask for.
+
+    Raises:
+        InputError: impossible settings, or nothing left.
+    """
+    if settings.stride < 1:
+        raise InputError(f"{recording.path}: stride {settings.stride} must be at least 1")
+    if settings.max_frames is not None and settings.max_frames < 1:
+        raise InputError(f"{recording.path}: max_frames {settings.max_frames} must be at least 1")
+    if settings.start < 0 or (settings.end is not None and settings.end < 0):
+        raise InputError(f"{recording.path}: start and end count frames from 0 and cannot be negative")
+    count = len(recording)
+    end = count if settings.end is None else min(settings.end, count)
+    indices = np.arange(settings.start, end, settings.stride, dtype=np.int64)[: settings.max_frames]
+    if len(indices) == 0:
+        raise InputError(
+            f"{recording.path}: has {count} frames, none of them from {settings.start} to {end}; change start or end"
+        )
+    return indices
+
+
+def _calibration(recording: Recording, settings: SequenceSettings, width: int, height: int) -> Calibration:
+    """What the user gave, else what the recording has, else the field of view."""
+    if settings.camera is not None:
+        return load_calibration(settings.camera)
+    if settings.fov is not None:
+        return from_field_of_view(settings.fov, width, height)
+    if recording.calibration is None:
+        raise InputError(
+            f"{recording.path}: has no calibration; give --camera FILE.yaml or fx,fy,cx,cy[,k1,k2,p1,p2,k3], "
+            f"or roughly --fov DEGREES (horizontal; 60 to 75 for most phones and webcams)"
+        )
+    return recording.calibration
+
+
+def _name(path: Path) -> str:
+    """A short name for titles and folders: the file's stem or the folder's name."""
+    name = path.stem if path.is_file() else path.absolute().name
+    return name or str(path)

@@ -1,0 +1,15 @@
+"""Settings of `improvo info`, importable without heavy modules."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from improvo.sequences.base import SequenceSettings
+
+
+@dataclass(frozen=True)
+class InfoSettings:
+    """`improvo info`."""
+
+    sequence: SequenceSettings = field(default_factory=SequenceSettings)
+    samples: int = 120  # pairs of neighbouring frames that are decoded, spread over the recording

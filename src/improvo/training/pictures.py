@@ -1,0 +1,157 @@
+"""Pictures to train on, held in memory: image folders and sequences, with what is known about their motion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from improvo.errors import InputError
+from improvo.types import Float64, UInt8
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
+
+
+@dataclass(frozen=True)
+class Source:
+    """One folder or sequence: a run of pictures in order."""
+
+    name: str
+    pictures: tuple[UInt8, ...]  # grey (H, W)
+    names: tuple[str, ...]
+    weight: float  # how often it is drawn from, relative to the others
+    # (N, 3, 3) K·R_cam_from_world per picture where the camera only turned, so that homographies between pictures are
+    # exact; None where that is not known
+    rotating: Float64 | None = None
+
+    def homography(self, a: int, b: int) -> Float64:
+        """(3, 3) from pixels of picture a to pixels of picture b of a camera that only turns."""
+        if a == b or self.rotating is None:
+            return np.eye(3)
+        H = self.rotating[b] @ np.linalg.inv(self.rotating[a])
+        return H / H[2, 2]
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """All sources of a training, and the files that could not be read."""
+
+    sources: tuple[Source, ...]
+    skipped: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return sum(len(source.pictures) for source in self.sources)
+
+    def draw(self, rng: np.random.Generator) -> tuple[int, int]:
+        """A source by weight, and one of its pictures."""
+        weights = np.cumsum([source.weight for source in self.sources])
+        chosen = int(np.searchsorted(weights, rng.uniform(0, weights[-1]), side="right"))
+        return chosen, int(rng.integers(len(self.sources[chosen].pictures)))
+
+
+def load_pictures(paths: Iterable[str], longer_side: int = 320, progress: bool = False) -> Pictures:
+    """Read image folders and sequences into memory, grey, reduced to `longer_side` where they are larger.
+
+    Args:
+        paths: folders or sequences, each optionally followed by `=WEIGHT`; without it a source weighs the square root
+            of its number of pictures, so that long recordings do not drown short ones.
+
+    Raises:
+        InputError: a source without a readable picture, or a weight that is not a positive number.
+    """
+    sources, skipped = [], []
+    for text in tqdm(list(paths), desc="reading pictures", unit="source", disable=not progress):
+        path, weight = _split_weight(text)
+        pictures, names, unread = _read(path, longer_side)
+        skipped += unread
+        if not pictures:
+            reason = f"none of its {len(unread)} pictures can be read" if unread else "has no pictures"
+            raise InputError(
+                f"{path}: {reason}; give a folder of images ({', '.join(SUFFIXES[:3])}, ...) or a sequence"
+            )
+        sources.append(
+            Source(
+                name=path.name,
+                pictures=tuple(pictures),
+                names=tuple(names),
+                weight=weight if weight is not None else float(np.sqrt(len(pictures))),
+                rotating=_rotating(path, len(pictures), pictures[0].shape) if not unread else None,
+            )
+        )
+    if not sources:
+        raise InputError("nothing to train on: give at least one image folder or sequence")
+    return Pictures(tuple(sources), tuple(skipped))
+
+
+def _split_weight(text: str) -> tuple[Path, float | None]:
+    head, separator, tail = text.rpartition("=")
+    if not separator or Path(text).exists():
+        return Path(text), None
+    try:
+        weight = float(tail)
+    except ValueError:
+        weight = -1.0
+    if not 0 < weight < float("inf"):
+        raise InputError(f"{text}: the weight after `=` must be a positive number")
+    return Path(head), weight
+
+
+def _read(path: Path, longer_side: int) -> tuple[list[UInt8], list[str], list[str]]:
+    """Pictures, their names, and the files that could not be read."""
+    files = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES) if path.is_dir() else []
+    if not files:
+        return _read_sequence(path, longer_side)
+    pictures, names, unread = [], [], []
+    for file in files:
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            unread.append(str(file))
+        else:
+            pictures.append(_reduced(image, longer_side))
+            names.append(file.name)
+    return pictures, names, unread
+
+
+def _read_sequence(path: Path, longer_side: int) -> tuple[list[UInt8], list[str], list[str]]:
+    if not path.exists():
+        raise InputError(f"{path}: does not exist; give a folder of images or a sequence")
+    if path.is_dir() and not any(path.iterdir()):
+        return [], [], []
+    from improvo.sequences import open_sequence
+
+    sequence = open_sequence(path)
+    pictures = [(_reduced(frame.image, longer_side), frame.source) for frame in sequence]
+    return [p for p, _ in pictures], [n for _, n in pictures], [skip.source for skip in sequence.skipped]
+
+
+def _reduced(image: UInt8, longer_side: int) -> UInt8:
+    scale = longer_side / max(image.shape)
+    if scale >= 1:
+        return image
+    size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def _rotating(path: Path, count: int, shape: Sequence[int]) -> Float64 | None:
+    """K·R of every picture if `groundtruth.txt` and `camera.yaml` say that the camera turns without moving."""
+    import yaml
+    from scipy.spatial.transform import Rotation
+
+    truth, camera = path / "groundtruth.txt", path / "camera.yaml"
+    if not (truth.is_file() and camera.is_file()):
+        return None
+    try:
+        rows = np.loadtxt(truth, ndmin=2)
+        values = yaml.safe_load(camera.read_text())
+        K = np.array([[values["fx"], 0, values["cx"]], [0, values["fy"], values["cy"]], [0, 0, 1]], np.float64)
+        pinhole = not any(values.get("distortion") or ()) and (values["height"], values["width"]) == tuple(shape)
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
+        return None
+    if not pinhole or rows.shape != (count, 8) or np.ptp(rows[:, 1:4], axis=0).max() > 1e-9:
+        return None
+    world_from_cam = Rotation.from_quat(rows[:, 4:8]).as_matrix()
+    return np.asarray(K @ world_from_cam.transpose(0, 2, 1))

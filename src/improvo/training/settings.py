@@ -1,0 +1,175 @@
+"""The settings of the training stages; importable without torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class OptimiserSettings:
+    """How weights are updated; the same for every stage."""
+
+    steps: int = 20000
+    batch_size: int = 8  # images (shapes) or pairs of images (homographies) a step
+    learning_rate: float = 1.5e-3
+    weight_decay: float = 1e-4
+    warmup_steps: int = 50  # linear from zero
+    decay_steps: int = 4000  # the last steps, at most a third of all, over which the rate falls linearly to zero
+    clip_norm: float = 5.0  # largest L2 norm of the gradient
+    ema: float = 0.998  # decay of the moving average of the weights; the average is what is saved
+    seed: int = 0
+    device: str = "auto"  # auto takes CUDA where there is one
+    # bfloat16 halves to thirds the time of a step where the processor has it (AVX-512 BF16, AMX, CUDA)
+    precision: str = "auto"  # auto | float32 | bfloat16
+    threads: int = 0  # of torch on the CPU; 0 leaves its default
+    workers: int = 1  # processes that prepare batches; 0 prepares them in the training process
+    checkpoint_minutes: float = 3.0
+    log_every: int = 20  # steps between rows of metrics.jsonl
+
+
+@dataclass(frozen=True)
+class DetectorLossSettings:
+    """What the detector head is taught beside SuperPoint's own loss."""
+
+    position_weight: float = 1.0  # of the term that says where in its cell a keypoint is; 0 is SuperPoint's loss
+    position_sigma: float = 0.7  # pixels; how sharply
+
+
+@dataclass(frozen=True)
+class ViewSettings:
+    """Random views of a picture, as a moving camera would see it."""
+
+    height: int = 120
+    width: int = 160
+    smallest_zoom: float = 0.7  # pixels of the picture per pixel of the view, log-uniform
+    largest_zoom: float = 2.0
+    rotation_degrees: float = 45.0  # largest in-plane rotation between a view and the picture
+    perspective: float = 0.2  # largest displacement of a corner, as a share of the view's side
+    stretch: float = 0.35  # largest log-ratio of the scales along two perpendicular directions (foreshortening)
+    shift: float = 0.3  # largest distance of the second view's centre from the first's, as a share of its side
+
+
+@dataclass(frozen=True)
+class PhotometricSettings:
+    """Random changes of light and sensor. A share is the probability that a change is applied."""
+
+    brightness: float = 40.0  # grey levels, largest
+    contrast: tuple[float, float] = (0.5, 1.4)
+    gamma: tuple[float, float] = (0.6, 1.7)
+    shade_share: float = 0.4
+    shade: float = 0.55  # largest darkening or brightening of a soft ellipse
+    vignette_share: float = 0.2
+    blur_share: float = 0.25
+    blur_sigma: float = 1.2  # pixels, largest
+    motion_share: float = 0.3
+    motion_length: int = 5  # pixels, longest
+    noise: float = 14.0  # grey levels, largest standard deviation
+    speckle: float = 0.0015  # largest share of pixels that become black or white
+    jpeg_share: float = 0.3
+    jpeg_quality: tuple[int, int] = (40, 95)
+
+
+@dataclass(frozen=True)
+class AdaptationSettings:
+    """Homographic adaptation: what a detector finds again in many random views of a picture."""
+
+    views: int = 30
+    keypoints_per_view: int = 300
+    border: int = 3  # pixels along the edge of a view that count for nothing
+    suppression: int = 4  # pixels, radius of non-maximum suppression on the consensus
+    # share of the views in which a point must be found again to be a label, and above which it is left undecided
+    accepted: float = 0.3
+    undecided: float = 0.15
+
+
+@dataclass(frozen=True)
+class HomographiesSettings:
+    """`improvo train homographies`: homographic adaptation, then detector and descriptor on pairs of views."""
+
+    architecture: str = "superpoint"
+    # channels of the first four layers that are used, the others stay zero (`improvo.frontend.live_channels`); 0 for as
+    # many as the weights use that are started from
+    stem_channels: int = 0
+    longer_side: int = 320  # pixels; larger pictures are reduced on loading
+    shapes: int = 450  # drawn pictures with exact corners among the others; 0 leaves them out
+    shapes_share: float = 0.12  # of the pairs
+    descriptor_loss: str = "info_nce"  # info_nce | hinge (SuperPoint's own)
+    descriptor_weight: float = 1.0
+    points: int = 256  # correspondences a pair; half of them at labelled keypoints
+    masked_pixels: float = 8.0  # points nearer than this are not each other's negatives
+    detector: DetectorLossSettings = field(default_factory=DetectorLossSettings)
+    optimiser: OptimiserSettings = field(default_factory=OptimiserSettings)
+    views: ViewSettings = field(default_factory=ViewSettings)
+    photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
+    adaptation: AdaptationSettings = field(default_factory=AdaptationSettings)
+
+
+@dataclass(frozen=True)
+class ShapesSettings:
+    """`improvo train shapes`: a detector from drawn shapes alone ("MagicPoint")."""
+
+    architecture: str = "superpoint"
+    detector: DetectorLossSettings = field(default_factory=DetectorLossSettings)
+    optimiser: OptimiserSettings = field(default_factory=lambda: OptimiserSettings(batch_size=32))
+    views: ViewSettings = field(default_factory=ViewSettings)
+    photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
+    adaptation: AdaptationSettings = field(default_factory=AdaptationSettings)
+
+
+@dataclass(frozen=True)
+class LandmarkSettings:
+    """What labelled frames tell beyond the tracks that each of them holds; pixels are those of the training picture."""
+
+    shared: bool = True  # the tracks of one map point are judged together; False is the paper: each for itself
+    unseen: bool = True  # stable points are also known where only their projection shows them; False is the paper
+    reprojected: bool = True  # a stable point lies at its projection, not at the keypoint; False is the paper
+    # pixels; an unstable track whose median error is smaller has a wrong link or two, which say nothing on the place it
+    # shows, and is not taught as unstable; 0 is the paper
+    unstable_median_error: float = 1.0
+    # an unstable track is not taught either if one link makes more than this share of the way that its error goes
+    # (`improvo.training.wrong_links`); 1 is the paper
+    unstable_largest_step: float = 0.25
+    largest_correction: float = 2.0  # pixels of the recording between the two; beyond it the keypoint holds
+    largest_view_angle_degrees: float = 40.0  # from the mean direction in which an unseen point was seen
+    largest_distance_ratio: float = 1.7  # to its mean distance, in either direction
+    # within this radius of an unseen point, a nearer point of the frame hides it, and one must be seen at all
+    occlusion_pixels: float = 14.0
+    occlusion_depth: float = 0.15  # by how much nearer, as a share
+
+
+@dataclass(frozen=True)
+class PairSettings:
+    """Which two frames make a pair, and what is taught about them."""
+
+    largest_gap: int = 60  # frames (paper, "Training Details")
+    wide_baselines: float = 0.5  # a gap is drawn with a density that rises with this power of it; 0 is uniform
+    same_frame_share: float = 0.3  # of the pairs show one frame twice, where every pixel's partner is known
+    rehearsed_share: float = 0.5  # of the pairs are homography pairs of other pictures, where such are given
+    least_points: int = 16  # correspondences that two frames must have; else nearer ones are taken
+    points: int = 256  # correspondences taught per pair
+    stability_points: int = 200  # labelled points taught per view, at most; as many unstable ones as there are
+    # a cell in which no keypoint was ever followed to a neighbouring frame is taught to have none; False ignores it
+    untracked_is_background: bool = True
+    # False: labelled frames teach descriptors and stability, and the detector learns from what is rehearsed alone
+    teach_detector: bool = True
+
+
+@dataclass(frozen=True)
+class OdometryTrainingSettings:
+    """`improvo train odometry`: VO adaptation, from label stores (paper, "Training Details")."""
+
+    longer_side: int = 320  # pixels; larger frames are reduced on loading
+    detector_weight: float = 0.3
+    descriptor_weight: float = 1.0
+    stability_weight: float = 1.0
+    negatives_across: bool = False  # a descriptor must also differ from those of the batch's other pairs
+    stability_alone: bool = False  # train only that head, on what the others read: keypoints and descriptors stay
+    masked_pixels: float = 8.0  # points nearer than this are not each other's negatives
+    detector: DetectorLossSettings = field(default_factory=DetectorLossSettings)
+    pairs: PairSettings = field(default_factory=PairSettings)
+    landmarks: LandmarkSettings = field(default_factory=LandmarkSettings)
+    optimiser: OptimiserSettings = field(
+        default_factory=lambda: OptimiserSettings(steps=2000, decay_steps=700, learning_rate=5e-4)
+    )
+    views: ViewSettings = field(default_factory=ViewSettings)
+    photometric: PhotometricSettings = field(default_factory=PhotometricSettings)

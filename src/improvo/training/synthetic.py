@@ -1,0 +1,56 @@
+"""Drawn shapes as training data: a source among photographs, and the batches of `improvo train shapes`."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from improvo.training.labels import PointLabels, label_cells
+from improvo.training.photometric import augment
+from improvo.training.pictures import Source
+from improvo.training.settings import ShapesSettings
+from improvo.training.shapes import FAMILIES, draw_shape
+from improvo.training.share import Share
+from improvo.training.views import random_view, warp_image, warp_points
+
+SIZE = (320, 240)  # width, height of the drawn pictures
+
+
+def shape_source(count: int, seed: int, weight: float) -> tuple[Source, list[PointLabels]]:
+    """`count` pictures, families in turn, with their exact corners as labels that every view agrees on."""
+    families = list(FAMILIES)
+    pictures, labels = [], []
+    for index in range(count):
+        image, points = draw_shape(np.random.default_rng([seed, index]), families[index % len(families)], *SIZE)
+        pictures.append(image)
+        labels.append(PointLabels(points, np.ones(len(points), np.float32)))
+    names = tuple(f"{families[index % len(families)]}-{index}" for index in range(count))
+    return Source("shapes", tuple(pictures), names, weight), labels
+
+
+class ShapeBatches:
+    """Batch number i of freshly drawn shapes: `images` (B, 1, H, W) uint8 and `cells` (B, Hc, Wc) int64."""
+
+    def __init__(self, settings: ShapesSettings) -> None:
+        self.settings = settings
+        self.share = Share.of_this_process()
+
+    def __len__(self) -> int:
+        return self.settings.optimiser.steps
+
+    def __getitem__(self, step: int) -> dict[str, np.ndarray]:
+        cv2.setNumThreads(0)
+        settings = self.settings
+        families = list(FAMILIES)
+        width, height = settings.views.width, settings.views.height
+        images, cells = [], []
+        for number in self.share.of(settings.optimiser.batch_size):
+            rng = np.random.default_rng([settings.optimiser.seed, step, number])
+            picture, points = draw_shape(rng, families[rng.integers(len(families))], *SIZE)
+            H = random_view(rng, settings.views, SIZE)
+            images.append(augment(warp_image(picture, H, width, height), rng, settings.photometric))
+            visible = cv2.warpPerspective(np.ones_like(picture), H, (width, height), flags=cv2.INTER_NEAREST) > 0
+            agreement = np.ones(len(points), np.float32)
+            seen = warp_points(H, points)
+            cells.append(label_cells(seen, agreement, visible, width, height, settings.adaptation))
+        return {"images": np.stack(images)[:, None], "cells": np.stack(cells)}

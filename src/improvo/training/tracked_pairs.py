@@ -1,0 +1,212 @@
+"""Batches of pairs of frames with what the odometry knows of them: what VO adaptation eats (paper, figure 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from improvo.labeling.stability import STABLE, UNSTABLE
+from improvo.training.labelled_frames import FramePoints, LabelledFrames, common_points
+from improvo.training.labels import DUSTBIN, IGNORED, label_cells
+from improvo.training.pairs import PairBatches, View
+from improvo.training.photometric import augment
+from improvo.training.settings import AdaptationSettings, OdometryTrainingSettings
+from improvo.training.share import Share
+from improvo.training.views import inside, random_view, warp_image, warp_points
+from improvo.types import Float32, Float64, Int64, UInt8
+
+Batch = dict[str, np.ndarray]  # see `TrackedPairs`
+_CERTAIN, _UNDECIDED = 1.0, 0.2  # agreement of labels as `label_cells` takes it, on either side of `accepted`
+
+
+@dataclass(frozen=True)
+class TrackedView:
+    """A frame through a homography and another light, with its points in the view's pixels."""
+
+    image: UInt8  # (H, W)
+    cells: Int64  # (Hc, Wc) see `label_cells`
+    known: FramePoints  # of the frame; `points` in pixels of the view, NaN or outside where not visible
+    view_from_frame: Float64  # (3, 3)
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """What the descriptor is taught on a pair; a row is a place in view a and one in view b."""
+
+    a: Float32  # (N, 2) pixels
+    b: Float32  # (N, 2)
+    valid: np.ndarray  # (N,) bool, both show the same point
+    negative: (
+        np.ndarray
+    )  # (N,) bool, the row may serve as a wrong partner for others: valid ones, and keypoints without
+
+
+class TrackedPairs:
+    """Batch number i, always the same for the same seed: (2B) images, first the a views, then the b views.
+
+    A batch has `images` (2B, 1, H, W) uint8, `cells` (2B, Hc, Wc) int64, `points_a`, `points_b` (B, N, 2) float32,
+    `valid`, `negative` (B, N) bool, `stability_points` (2B, M, 2) float32 and `stability` (2B, M) int64: 1 stable,
+    0 unstable, IGNORED.
+
+    Args:
+        rehearsed: homography pairs of other pictures, which keep the network general; `pairs.rehearsed_share` of all.
+    """
+
+    def __init__(
+        self,
+        sequences: Sequence[LabelledFrames],
+        settings: OdometryTrainingSettings,
+        rehearsed: PairBatches | None = None,
+    ) -> None:
+        self.sequences, self.settings, self.rehearsed = sequences, settings, rehearsed
+        self.useful = [frames.useful_frames(settings.pairs.least_points) for frames in sequences]
+        # as with pictures: long recordings do not drown short ones
+        self._cumulative = np.cumsum(np.sqrt([len(useful) for useful in self.useful]))
+        self.share = Share.of_this_process()
+        taught = np.array([frames.taught_stability() for frames in sequences]).sum(axis=0)
+        self.stable_per_unstable = float(taught[0] / max(taught[1], 1))
+
+    def __len__(self) -> int:
+        return self.settings.optimiser.steps
+
+    def __getitem__(self, step: int) -> Batch:
+        cv2.setNumThreads(0)
+        seed = self.settings.optimiser.seed
+        own = self.share.of(self.settings.optimiser.batch_size)
+        pairs = [self._pair(np.random.default_rng([seed, step, number])) for number in own]
+        views = [pair[0] for pair in pairs] + [pair[1] for pair in pairs]
+        taught = [self._stability(np.random.default_rng([seed, step, n, 1]), view) for n, view in enumerate(views)]
+        return {
+            "images": np.stack([view.image for view in views])[:, None],
+            "cells": np.stack([view.cells for view in views]),
+            "points_a": np.stack([pair[2].a for pair in pairs]),
+            "points_b": np.stack([pair[2].b for pair in pairs]),
+            "valid": np.stack([pair[2].valid for pair in pairs]),
+            "negative": np.stack([pair[2].negative for pair in pairs]),
+            "stability_points": np.stack([points for points, _ in taught]),
+            "stability": np.stack([codes for _, codes in taught]),
+        }
+
+    def _pair(self, rng: np.random.Generator) -> tuple[TrackedView, TrackedView, Correspondences]:
+        if self.rehearsed and rng.uniform() < self.settings.pairs.rehearsed_share:
+            first, second, (points_a, points_b, valid) = self.rehearsed.pair(rng)
+            return _unlabelled(first), _unlabelled(second), Correspondences(points_a, points_b, valid, valid)
+        chosen = int(np.searchsorted(self._cumulative, rng.uniform(0, self._cumulative[-1]), side="right"))
+        frames = self.sequences[chosen]
+        frame_a = int(rng.choice(self.useful[chosen]))
+        a = frames.points(frame_a)
+        frame_b, b = self._partner(rng, frames, frame_a, a)
+        rows_a, rows_b = common_points(a, b)
+        middle = int(rng.integers(len(rows_a)))
+        view_a = self._view(rng, frames, frame_a, a, a.points[rows_a[middle]])
+        visible = inside(view_a.known.points[rows_a], self.settings.views.width, self.settings.views.height)
+        centre = np.median(b.points[rows_b][visible], axis=0) if visible.any() else b.points[rows_b[middle]]
+        view_b = self._view(rng, frames, frame_b, b, centre)
+        if frame_a == frame_b:
+            return view_a, view_b, self._same_frame(rng, view_a, view_b, frames.size)
+        return view_a, view_b, self._two_frames(rng, view_a, view_b, rows_a, rows_b)
+
+    def _partner(
+        self, rng: np.random.Generator, frames: LabelledFrames, frame_a: int, a: FramePoints
+    ) -> tuple[int, FramePoints]:
+        """Another frame, as far away as drawn or, where too few points are common, nearer; or the same one."""
+        settings = self.settings.pairs
+        if rng.uniform() < settings.same_frame_share:
+            return frame_a, a
+        gap = settings.largest_gap * rng.uniform() ** (1 / (1 + settings.wide_baselines)) * rng.choice([-1, 1])
+        while abs(gap) >= 1:
+            frame_b = int(np.clip(frame_a + round(gap), 0, len(frames) - 1))
+            if frame_b != frame_a:
+                b = frames.points(frame_b)
+                if len(common_points(a, b)[0]) >= settings.least_points:
+                    return frame_b, b
+            gap /= 2
+        return frame_a, a
+
+    def _view(
+        self, rng: np.random.Generator, frames: LabelledFrames, frame: int, known: FramePoints, centre: Float64
+    ) -> TrackedView:
+        settings = self.settings
+        width, height = settings.views.width, settings.views.height
+        picture = frames.picture(frame)
+        H = random_view(rng, settings.views, frames.size, centre)
+        image = augment(warp_image(picture, H, width, height), rng, settings.photometric)
+        visible = cv2.warpPerspective(np.ones_like(picture), H, (width, height), flags=cv2.INTER_NEAREST) > 0
+        points = warp_points(H, known.points)
+        # unstable and unknown points: the detector may see them as it likes
+        agreement = np.where(known.stability == STABLE, _CERTAIN, _UNDECIDED).astype(np.float32)
+        cells = label_cells(points, agreement, visible, width, height, AdaptationSettings())
+        if not settings.pairs.teach_detector:
+            cells[:] = IGNORED
+        if not settings.pairs.untracked_is_background:
+            cells[cells == DUSTBIN] = IGNORED
+        return TrackedView(image, cells, replace(known, points=points), H)
+
+    def _two_frames(
+        self, rng: np.random.Generator, a: TrackedView, b: TrackedView, rows_a: Int64, rows_b: Int64
+    ) -> Correspondences:
+        """Landmarks that both views show, and keypoints without a known partner: wrong partners for the others."""
+        width, height, count = self.settings.views.width, self.settings.views.height, self.settings.pairs.points
+        both = inside(a.known.points[rows_a], width, height) & inside(b.known.points[rows_b], width, height)
+        chosen = rng.permutation(np.flatnonzero(both))[:count]
+        result = _empty(count)
+        number = len(chosen)
+        result.a[:number], result.b[:number] = a.known.points[rows_a[chosen]], b.known.points[rows_b[chosen]]
+        result.valid[:number] = True
+        alone_a = _others(rng, a.known.points, rows_a, width, height)
+        alone_b = _others(rng, b.known.points, rows_b, width, height)
+        spare = min(count - number, len(alone_a), len(alone_b))
+        result.a[number : number + spare], result.b[number : number + spare] = alone_a[:spare], alone_b[:spare]
+        result.negative[: number + spare] = True
+        return result
+
+    def _same_frame(
+        self, rng: np.random.Generator, a: TrackedView, b: TrackedView, size: tuple[int, int]
+    ) -> Correspondences:
+        """Every pixel has a partner: half of the places are known points of view a, the rest anywhere."""
+        width, height, count = self.settings.views.width, self.settings.views.height, self.settings.pairs.points
+        result = _empty(count)
+        result.a[:] = rng.uniform((0, 0), (width - 1, height - 1), (count, 2))
+        shown = a.known.points[inside(a.known.points, width, height) & (a.known.stability != UNSTABLE)]
+        shown = shown[rng.permutation(len(shown))[: count // 2]]
+        result.a[: len(shown)] = shown
+        frame_from_a = np.linalg.inv(a.view_from_frame)
+        places_b = warp_points(b.view_from_frame @ frame_from_a, result.a)
+        result.valid[:] = inside(places_b, width, height) & inside(warp_points(frame_from_a, result.a), *size)
+        result.b[:] = np.where(result.valid[:, None], places_b, 0)
+        result.negative[:] = result.valid
+        return result
+
+    def _stability(self, rng: np.random.Generator, view: TrackedView) -> tuple[Float32, Int64]:
+        """Labelled points of the view: at most half of them unstable, then stable ones."""
+        count = self.settings.pairs.stability_points
+        points, codes = np.zeros((count, 2), np.float32), np.full(count, IGNORED, np.int64)
+        known = view.known
+        labelled = inside(known.points, self.settings.views.width, self.settings.views.height) & known.seen
+        unstable = rng.permutation(np.flatnonzero(labelled & (known.stability == UNSTABLE)))[: count // 2]
+        stable = rng.permutation(np.flatnonzero(labelled & (known.stability == STABLE)))
+        rows = np.concatenate([unstable, stable])[:count]
+        points[: len(rows)] = known.points[rows]
+        codes[: len(rows)] = known.stability[rows] == STABLE
+        return points, codes
+
+
+def _unlabelled(view: View) -> TrackedView:
+    """A view of a picture of which no stability is known."""
+    nothing = FramePoints(np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int8), np.zeros(0, np.bool_))
+    return TrackedView(view.image, view.cells, nothing, view.view_from_picture)
+
+
+def _empty(count: int) -> Correspondences:
+    zeros = np.zeros((count, 2), np.float32)
+    return Correspondences(zeros, zeros.copy(), np.zeros(count, np.bool_), np.zeros(count, np.bool_))
+
+
+def _others(rng: np.random.Generator, points: Float64, common: Int64, width: int, height: int) -> Float64:
+    """Points of a view that are not among the common ones, shuffled."""
+    alone = inside(points, width, height)
+    alone[common] = False
+    return points[rng.permutation(np.flatnonzero(alone))]

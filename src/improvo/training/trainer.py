@@ -1,0 +1,260 @@
+"""The training loop of every stage: seeded, resumable to the bit, with metrics and checkpoints.
+
+Batch number i is a function of the seed and i alone, and a step of the batch and the weights alone. So a run that was
+killed and continues from its checkpoint ends with the weights of one that was not.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from copy import deepcopy
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, distributed, nn
+from torch.utils.data import DataLoader
+from tqdm import tqdm
+
+from improvo import files
+from improvo.errors import ImprovoError, InputError
+from improvo.training.settings import OptimiserSettings
+from improvo.training.share import Share
+
+CHECKPOINT = "checkpoint.pt"
+METRICS = "metrics.jsonl"
+
+
+class Batches(Protocol):
+    """Batches by number, made by any process."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, step: int) -> dict[str, Any]: ...
+
+
+class Stage(nn.Module):
+    """What a training stage teaches: a network and its losses. Subclasses are the stages."""
+
+    network: nn.Module
+
+    def losses(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Named scalars of one batch; `loss` is the one that is minimised."""
+        raise NotImplementedError
+
+
+class DivergedError(ImprovoError):
+    """The loss is no longer a number."""
+
+
+def choose_device(name: str) -> torch.device:
+    """`auto` is CUDA where there is one."""
+    return torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
+
+
+def choose_precision(name: str, device: torch.device) -> torch.dtype:
+    """`auto` is bfloat16 on processors that multiply it natively; elsewhere it would be emulated, and slow."""
+    if name == "auto":
+        capable = (
+            torch.cuda.is_bf16_supported() if device.type == "cuda" else torch.ops.mkldnn._is_mkldnn_bf16_supported()
+        )
+        return torch.bfloat16 if capable else torch.float32
+    return {"float32": torch.float32, "bfloat16": torch.bfloat16}[name]
+
+
+class Trainer:
+    """Runs one stage.
+
+    Args:
+        stage: network and losses.
+        batches: the data, by step.
+        settings: see `OptimiserSettings`.
+        folder: gets `checkpoint.pt` and `metrics.jsonl`.
+    """
+
+    def __init__(self, stage: Stage, batches: Batches, settings: OptimiserSettings, folder: Path) -> None:
+        if settings.threads:
+            torch.set_num_threads(settings.threads)
+        self.device = choose_device(settings.device)
+        self.precision = choose_precision(settings.precision, self.device)
+        self.stage = stage.to(self.device, memory_format=torch.channels_last)
+        self.average = deepcopy(self.stage).requires_grad_(False)
+        self.batches, self.settings, self.folder = batches, settings, folder
+        decayed = [p for p in stage.parameters() if p.ndim > 1]
+        others = [p for p in stage.parameters() if p.ndim <= 1]
+        self.optimiser = torch.optim.AdamW(
+            [{"params": decayed, "weight_decay": settings.weight_decay}, {"params": others, "weight_decay": 0.0}],
+            lr=settings.learning_rate,
+            fused=True,
+        )
+        self.share = Share.of_this_process()
+        if self.share.processes > 1 and not distributed.is_initialized():
+            distributed.init_process_group("nccl" if self.device.type == "cuda" else "gloo")
+        self.step = 0
+        self.seconds = 0.0  # of training, over all runs
+
+    def resume(self) -> bool:
+        """Continue from the folder's checkpoint, if there is one; rows of metrics behind it are dropped.
+
+        Raises:
+            InputError: the checkpoint is not readable or of another network.
+        """
+        path = self.folder / CHECKPOINT
+        if not path.is_file():
+            return False
+        try:
+            state = torch.load(path, map_location=self.device, weights_only=True)
+            self.stage.load_state_dict(state["stage"])
+            self.average.load_state_dict(state["average"])
+            self.optimiser.load_state_dict(state["optimiser"])
+            self.step, self.seconds = int(state["step"]), float(state["seconds"])
+        except Exception as error:  # torch raises many kinds; none of them is worth a traceback
+            reason = str(error).splitlines()[0]
+            raise InputError(f"{path}: cannot be continued from ({reason}); choose a new output folder") from None
+        if not self.share.leads:
+            return True
+        metrics = self.folder / METRICS
+        rows = metrics.read_text().splitlines(keepends=True) if metrics.is_file() else []
+        files.write_text(metrics, "".join(row for row in rows if json.loads(row)["step"] <= self.step))
+        return True
+
+    def save(self) -> None:
+        """Write the checkpoint atomically."""
+        state = {
+            "stage": self.stage.state_dict(),
+            "average": self.average.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "step": self.step,
+            "seconds": self.seconds,
+        }
+        with files.written_atomically(self.folder / CHECKPOINT) as temporary:
+            try:
+                torch.save(state, temporary)
+            except RuntimeError as error:  # what torch makes of a full disk
+                raise OSError(f"is the disk full? {str(error).splitlines()[0]}") from None
+
+    def run(self, progress: bool = True, on_checkpoint: Any = None) -> nn.Module:
+        """Train up to the last step; returns the averaged network.
+
+        Args:
+            on_checkpoint: called with this trainer after every checkpoint.
+
+        Raises:
+            DivergedError: the loss is NaN or infinite; the last checkpoint stays.
+        """
+        settings = self.settings
+        self.stage.train()
+        sums: dict[str, Tensor] = {}
+        window_start = saved = time.monotonic()
+        count, waiting = 0, 0.0
+        loader = iter(self._loader())
+        for _ in tqdm(range(self.step, settings.steps), "training", initial=self.step, total=settings.steps,
+                      unit="step", disable=not (progress and self.share.leads)):  # fmt: skip
+            before = time.monotonic()
+            batch = next(loader)
+            waiting += time.monotonic() - before
+            for name, value in self._step(batch).items():
+                sums[name] = sums[name] + value if name in sums else value
+            self.step += 1
+            count += 1
+            if self.step % settings.log_every and self.step < settings.steps:
+                continue
+            now = time.monotonic()
+            row = {name: float(value) / count for name, value in sums.items()}
+            self._stop_if_diverged(row["loss"])
+            self.seconds += now - window_start
+            self._log(row, (now - window_start) / count, waiting / (now - window_start))
+            sums, count, waiting, window_start = {}, 0, 0.0, now
+            if self.share.leads and (now - saved > 60 * settings.checkpoint_minutes or self.step == settings.steps):
+                self.save()
+                saved = now
+                if on_checkpoint:
+                    on_checkpoint(self)
+        if self.share.processes > 1:
+            distributed.barrier()  # nobody goes on before the files are written
+        network: nn.Module = self.average.network
+        return network.eval()
+
+    def _step(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        settings = self.settings
+        batch = {name: value.to(self.device, non_blocking=True) for name, value in batch.items()}
+        if "images" in batch:
+            images = batch["images"].float() / 255
+            batch["images"] = images.contiguous(memory_format=torch.channels_last)
+        for group in self.optimiser.param_groups:
+            group["lr"] = settings.learning_rate * self._rate(self.step)
+        with self._autocast():
+            losses = self.stage.losses(batch)
+        self.optimiser.zero_grad(set_to_none=True)
+        losses["loss"].backward()
+        self._share_gradients()
+        nn.utils.clip_grad_norm_(self.stage.parameters(), settings.clip_norm)
+        self.optimiser.step()
+        self._follow()
+        return {name: value.detach() for name, value in losses.items()}
+
+    def _share_gradients(self) -> None:
+        """The mean gradient over all processes, which start from the same weights and so keep them equal."""
+        if self.share.processes == 1:
+            return
+        gradients = [p.grad for p in self.stage.parameters() if p.grad is not None]
+        flat = torch.cat([gradient.flatten() for gradient in gradients])
+        distributed.all_reduce(flat)
+        for gradient, mean in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
+            gradient.copy_(mean.view_as(gradient) / self.share.processes)
+
+    def _rate(self, step: int) -> float:
+        """Share of the learning rate: linear warm-up, constant, linear fall to zero over the last steps."""
+        settings = self.settings
+        rising = (step + 1) / max(settings.warmup_steps, 1)
+        falling = (settings.steps - step) / max(min(settings.decay_steps, settings.steps // 3), 1)
+        return min(1.0, rising, falling)
+
+    def _follow(self) -> None:
+        """Exponential moving average of weights and batch-norm statistics; young averages follow faster."""
+        decay = min(self.settings.ema, (1 + self.step) / (10 + self.step))
+        current = self.stage.state_dict()
+        with torch.no_grad():
+            for name, value in self.average.state_dict().items():
+                if value.is_floating_point():
+                    value.lerp_(current[name], 1 - decay)
+                else:
+                    value.copy_(current[name])
+
+    def _autocast(self) -> AbstractContextManager[None]:
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == torch.bfloat16)
+
+    def _loader(self) -> Iterator[dict[str, Tensor]]:
+        workers = self.settings.workers
+        return DataLoader(
+            self.batches,
+            batch_size=None,
+            sampler=range(self.step, self.settings.steps),
+            num_workers=workers,
+            prefetch_factor=4 if workers else None,
+            pin_memory=self.device.type == "cuda",
+        )
+
+    def _stop_if_diverged(self, loss: float) -> None:
+        if not math.isfinite(loss):
+            raise DivergedError(
+                f"{self.folder}: the loss is {loss} at step {self.step}; the last checkpoint is kept: lower "
+                "learning_rate or clip_norm, or use precision=float32, and start again"
+            )
+
+    def _log(self, losses: dict[str, float], step_seconds: float, loading: float) -> None:
+        if not self.share.leads:
+            return
+        row = {
+            "step": self.step,
+            **{name: round(value, 6) for name, value in losses.items()},
+            "learning_rate": self.settings.learning_rate * self._rate(self.step - 1),
+            "step_seconds": round(step_seconds, 4),
+            "loading_share": round(loading, 4),
+        }
+        with (self.folder / METRICS).open("a") as stream:
+            stream.write(json.dumps(row) + "\n")
