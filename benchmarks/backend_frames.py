@@ -10,9 +10,10 @@ import numpy as np
 import poselib
 
 from backend_windows import Recording, triangulate
-from improvo.backend import BundleProblem, BundleResult, SolverSettings, solve, triangulate_tracks
+from improvo.backend import BundleProblem, BundleResult, SolverSettings, solve
 from improvo.geometry import se3
 from improvo.geometry.alignment import align_points
+from improvo.geometry.triangulation import triangulate_tracks
 from improvo.types import Float64, Int64
 
 WINDOW = 30  # poses that are optimised (paper, N_last)

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from improvo.backend import BundleProblem, Triangulation, triangulate_tracks
+from improvo.backend import BundleProblem
 from improvo.backend.simulated import simulated_window
 from improvo.frontend.registry import load_frontend
 from improvo.geometry import se3
+from improvo.geometry.triangulation import Triangulation, triangulate_tracks
 from improvo.sequences import open_sequence
 from improvo.tracking.connect import TrackChain
 from improvo.tracking.matching import mutual_nearest_neighbours

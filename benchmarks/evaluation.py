@@ -18,14 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
-from improvo.evaluation.cache import write_cache
-from improvo.evaluation.pairs import SequencePairs, pairs_of_sequence
-from improvo.evaluation.parallel import Workers, available_cores
-from improvo.evaluation.pose import ExtractionTask, evaluate_pairs, extract, pair_tasks
-from improvo.evaluation.pose_results import results
-from improvo.evaluation.pose_run import PoseRun
+from improvo.evaluation.pose.cache import write_cache
+from improvo.evaluation.pose.pairs import SequencePairs, pairs_of_sequence
+from improvo.evaluation.pose.protocol import ExtractionTask, evaluate_pairs, extract, pair_tasks
+from improvo.evaluation.pose.results import results
+from improvo.evaluation.pose.run import PoseRun
 from improvo.evaluation.settings import PoseSettings
 from improvo.evaluation.sources import LoadedFrontend, Recorded
+from improvo.jobs.pool import Workers, available_cores
 from improvo.types import Features
 
 

@@ -25,11 +25,11 @@ import cv2
 import numpy as np
 
 from improvo.frontend.architecture import ARCHITECTURES
-from improvo.frontend.calibration import calibrate
+from improvo.frontend.channel_pruning import without_dead_channels
 from improvo.frontend.classical import ClassicalFrontend
 from improvo.frontend.decoding import decode
-from improvo.frontend.live_channels import without_dead_channels
 from improvo.frontend.network import NetworkFrontend, prepare
+from improvo.frontend.quantisation import calibrate
 from improvo.frontend.settings import NetworkSettings
 from improvo.frontend.weights import ModelCard, Weights, bundled_names, expected_shapes, find_weights, load_weights
 from improvo.tracking.matching import mutual_nearest_neighbours
@@ -184,7 +184,7 @@ def onnx_contenders(weights: Weights, batch: Any, threads: int) -> dict[str, Cal
         return {}
     from tempfile import TemporaryDirectory
 
-    from improvo.frontend.onnx_export import export_onnx
+    from improvo.export.onnx import export_onnx
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads

@@ -14,8 +14,8 @@ import numpy as np
 
 from improvo.files import write_json
 from improvo.geometry import se3
-from improvo.labeling.settings import LabelSettings
-from improvo.labeling.stability import STABLE, UNSTABLE, label_stability
+from improvo.stability.rule import STABLE, UNSTABLE, label_stability
+from improvo.stability.settings import LabelSettings
 from improvo.types import Float64, Tracks
 
 FRAMES = 60

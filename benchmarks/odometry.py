@@ -26,7 +26,7 @@ import numpy as np
 
 from improvo.backend.compile import compile_kernels
 from improvo.evaluation.settings import TrajectorySettings
-from improvo.evaluation.trajectory import evaluate_trajectory
+from improvo.evaluation.trajectory.protocol import evaluate_trajectory
 from improvo.frontend.registry import load_odometry_frontend
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.visual_odometry import VisualOdometry

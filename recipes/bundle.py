@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from improvo.cli.train_homographies import read_data_card
-from improvo.frontend.calibration import calibrate
+from improvo.frontend.quantisation import calibrate
 from improvo.frontend.weights import BUNDLED, Weights, load_weights, save_weights
 
 NO_HEAD = "The stability head is not part of these weights: only VO adaptation can teach it. "

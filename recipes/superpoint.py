@@ -22,8 +22,8 @@ from pathlib import Path
 
 from improvo.cli.train_homographies import read_data_card
 from improvo.errors import ImprovoError
+from improvo.training.distributed import Share
 from improvo.training.settings import HomographiesSettings
-from improvo.training.share import Share
 from improvo.training.stages import train_homographies
 
 HERE = Path(__file__).parent

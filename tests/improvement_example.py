@@ -20,9 +20,9 @@ from improvo.files import make_output_folder, write_json
 from improvo.frontend.weights import Weights, find_weights, load_weights, save_weights
 from improvo.improvement.improve import Improvement, improve
 from improvo.improvement.settings import HeldBackSettings, ImproveSettings, JudgeSettings
-from improvo.labeling.settings import LabelSettings
 from improvo.odometry.run_settings import FrontendSettings
 from improvo.odometry.settings import OdometrySettings, StartSettings
+from improvo.stability.settings import LabelSettings
 from improvo.training.settings import OdometryTrainingSettings
 
 SPOILED = "spoiled"  # stands for bundled weights with so much noise that a sixth of the matches is lost

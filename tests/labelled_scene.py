@@ -11,12 +11,12 @@ import numpy as np
 from improvo.config import to_dict
 from improvo.geometry.camera import Camera
 from improvo.labeling.frames import FRAMES_FILE, FramesTable, pack_images, write_frames
-from improvo.labeling.settings import LabelSettings
-from improvo.labeling.stability import IGNORE, STABLE, UNSTABLE
 from improvo.labeling.store import DONE, LabelStore, SequenceRecord
-from improvo.labeling.tables import POINTS_FILE, TRACKS_FILE, PointsTable, PointsWriter, TracksWriter
 from improvo.sequences import write_trajectory
 from improvo.sequences.base import SequenceSettings
+from improvo.stability.rule import IGNORE, STABLE, UNSTABLE
+from improvo.stability.settings import LabelSettings
+from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, PointsWriter, TracksWriter
 from improvo.types import Float64, Trajectory
 
 CAMERA = Camera(width=160, height=120, fx=120.0, fy=120.0, cx=79.5, cy=59.5)

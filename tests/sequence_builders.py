@@ -9,7 +9,7 @@ import numpy as np
 
 from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import rigid, so3_exp
-from improvo.sequences.tum_rgbd import TumRgbdWriter
+from improvo.simulation.tum_writer import TumRgbdWriter
 from improvo.types import Float64, UInt8
 
 CAMERA = Camera(96, 72, 90.0, 91.0, 47.0, 36.5)

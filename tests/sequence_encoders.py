@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from improvo.geometry.camera import Camera
+from improvo.geometry.camera_files import calibration_yaml
 from improvo.geometry.se3 import inverse, quat_xyzw_from_rotation
-from improvo.sequences.calibration import calibration_yaml
-from improvo.sequences.tum_rgbd import TumRgbdWriter
+from improvo.simulation.tum_writer import TumRgbdWriter
 from improvo.types import Float64, UInt8
 
 _CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -8,9 +8,10 @@ import sys
 import numpy as np
 import pytest
 
-from improvo.backend import TriangulationSettings, triangulate_tracks
 from improvo.backend.simulated import simulated_window
 from improvo.errors import ConfigError
+from improvo.geometry.settings import TriangulationSettings
+from improvo.geometry.triangulation import triangulate_tracks
 
 LOSSES = ("huber", "geman_mcclure")
 

@@ -18,7 +18,7 @@ from rendered_walk import write_walk
 
 from improvo.cli.main import main
 from improvo.labeling.labelled import read_labels
-from improvo.labeling.stability import STABLE
+from improvo.stability.rule import STABLE
 
 OPTIONS = ["--frontend", "orb", "--max-keypoints", "300", "--set", "labels.min_observations=6"]
 

@@ -18,8 +18,8 @@ import pytest
 from rendered_walk import CAMERA, write_walk
 
 from improvo.cli.main import main
-from improvo.labeling.tables import read_points, read_tracks
 from improvo.sequences import read_trajectory
+from improvo.stability.tables import read_points, read_tracks
 
 CAMERA_TEXT = f"{CAMERA.fx},{CAMERA.fy},{CAMERA.cx},{CAMERA.cy}"
 

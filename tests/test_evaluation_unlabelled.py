@@ -11,8 +11,8 @@ from rendered_walk import write_walk
 from simulated_features import CAMERA, hand_motion, nothing_to_see, observe, room
 
 from improvo.errors import ConfigError
+from improvo.evaluation.pose.unlabelled import agreeing_matches, spread_pairs, surviving_matches, usable_gaps
 from improvo.evaluation.settings import SurvivalSettings
-from improvo.evaluation.unlabelled import agreeing_matches, spread_pairs, surviving_matches, usable_gaps
 from improvo.frontend.registry import load_frontend
 from improvo.sequences import open_sequence
 from improvo.types import Features

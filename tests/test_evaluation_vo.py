@@ -14,12 +14,12 @@ from improvo.cli.main import main
 from improvo.errors import InputError
 from improvo.evaluation import vo
 from improvo.evaluation.settings import TrajectorySettings
-from improvo.evaluation.trajectory_tables import vo_tables
-from improvo.evaluation.vo import WITH, WITHOUT, evaluate_vo, usable
+from improvo.evaluation.trajectory.tables import vo_tables
+from improvo.evaluation.vo.protocol import WITH, WITHOUT, evaluate_vo, usable
 from improvo.frontend import Frontend
 from improvo.geometry.se3 import rigid, so3_exp
+from improvo.geometry.trajectory_files import write_trajectory
 from improvo.odometry.settings import OdometrySettings
-from improvo.sequences.trajectory_files import write_trajectory
 from improvo.types import Features, Frame, Trajectory, UInt8
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from improvo.frontend.architecture import Architecture
-from improvo.frontend.live_channels import with_dead_channels, without_dead_channels
+from improvo.frontend.channel_pruning import with_dead_channels, without_dead_channels
 from improvo.frontend.network import NetworkFrontend, prepare
 from improvo.frontend.settings import NetworkSettings
 from improvo.frontend.weights import ModelCard, Weights, load_weights, save_weights

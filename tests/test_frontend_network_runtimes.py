@@ -13,8 +13,8 @@ import pytest
 from improvo.cli.main import main
 from improvo.errors import ConfigError, InputError
 from improvo.frontend.architecture import ARCHITECTURES
-from improvo.frontend.calibration import calibrate
 from improvo.frontend.network import NetworkFrontend, prepare
+from improvo.frontend.quantisation import calibrate
 from improvo.frontend.settings import NetworkSettings
 from improvo.frontend.weights import save_weights
 from network_examples import TINY, lit_pixel_weights, random_weights
@@ -197,7 +197,7 @@ def test_exported_onnx_gives_the_same_features(tmp_path, normalisation, subpixel
 def test_exported_onnx_finds_lit_pixels(tmp_path):
     pytest.importorskip("onnx")
     runtime = pytest.importorskip("onnxruntime")
-    from improvo.frontend.onnx_export import export_onnx
+    from improvo.export.onnx import export_onnx
 
     export_onnx(
         lit_pixel_weights(), tmp_path / "m.onnx", NetworkSettings(max_keypoints=5, subpixel_radius=0, corner_radius=0)

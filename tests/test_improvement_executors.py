@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from improvo.improvement.executors import Tick, WorkerDiedError, run_here, run_in_processes
+from improvo.jobs.processes import Tick, WorkerDiedError, run_here, run_in_processes
 
 
 def halve(number: int, tick: Tick) -> tuple[int, str | None]:

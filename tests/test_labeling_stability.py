@@ -7,8 +7,8 @@ import pytest
 
 from improvo.backend.simulated import simulated_window
 from improvo.errors import ConfigError
-from improvo.labeling.settings import LabelSettings
-from improvo.labeling.stability import IGNORE, STABLE, UNSTABLE, classify, label_stability
+from improvo.stability.rule import IGNORE, STABLE, UNSTABLE, classify, label_stability
+from improvo.stability.settings import LabelSettings
 from improvo.types import Tracks
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from improvo.errors import InputError, OutputError
 from improvo.labeling import tables
-from improvo.labeling.stability import IGNORE, STABLE, UNSTABLE, TrackLabels
+from improvo.stability.rule import IGNORE, STABLE, UNSTABLE, TrackLabels
 
 
 def some_labels(count: int = 5) -> TrackLabels:

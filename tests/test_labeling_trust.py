@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from improvo.labeling.settings import LabelSettings, TrustSettings
-from improvo.labeling.stability import IGNORE, STABLE, UNSTABLE
-from improvo.labeling.tables import PointsTable, TracksTable
-from improvo.labeling.trust import judge_frames, withhold_labels
+from improvo.labeling.quality import judge_frames, withhold_labels
+from improvo.stability.rule import IGNORE, STABLE, UNSTABLE
+from improvo.stability.settings import LabelSettings, TrustSettings
+from improvo.stability.tables import PointsTable, TracksTable
 
 FRAMES = 60
 

@@ -16,11 +16,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from improvo.cli.main import main
-from improvo.labeling.tables import read_tracks
-from improvo.report.model import segment_model
-from improvo.report.run_folder import RunFolder, read_map
-from improvo.report.trajectory_export import export_trajectory
+from improvo.export.model import segment_model
+from improvo.export.trajectory import export_trajectory
+from improvo.odometry.run_folder import RunFolder, read_map
 from improvo.sequences import open_sequence, read_trajectory
+from improvo.stability.tables import read_tracks
 from improvo.types import Trajectory
 
 

@@ -11,14 +11,14 @@ import pytest
 
 from improvo.cli.main import main
 from improvo.geometry.se3 import rigid, so3_exp
-from improvo.labeling.stability import STABLE
+from improvo.odometry.run_folder import RunFolder
 from improvo.report.canvas import Canvas
 from improvo.report.overhead import overhead_axes, robust_limits
 from improvo.report.palettes import PALETTES
-from improvo.report.run_folder import RunFolder
 from improvo.report.sheets import write_video
 from improvo.report.stability_picture import suppressed_regions
 from improvo.report.track_pictures import TrackPictureSettings, paint_labels, paint_tracks
+from improvo.stability.rule import STABLE
 from improvo.types import Float64
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from improvo.errors import ConfigError, ImprovoError, InputError
+from improvo.geometry.camera_files import calibration_yaml
 from improvo.sequences import open_sequence
-from improvo.sequences.calibration import calibration_yaml
 from improvo.types import Trajectory
 from sequence_builders import CAMERA, images, poses, write_images, write_tum
 

@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 import pytest
 
+from improvo.calibration.board import Board, _black, parse_board
+from improvo.calibration.camera_fit import choose_views, find_views, fit_camera
 from improvo.cli.main import main
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
+from improvo.geometry.camera_files import load_calibration
 from improvo.geometry.se3 import rigid, so3_exp
-from improvo.sequences.board import Board, _black, parse_board
-from improvo.sequences.calibration import load_calibration
-from improvo.sequences.camera_fit import choose_views, find_views, fit_camera
 from improvo.types import Float64, UInt8
 
 CAMERA = Camera(640, 480, 420.0, 424.0, 312.0, 246.0, (-0.28, 0.09, 0.0004, -0.0006))

@@ -10,7 +10,7 @@ import pytest
 
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
-from improvo.sequences.calibration import calibration_yaml, from_field_of_view, load_calibration
+from improvo.geometry.camera_files import calibration_yaml, from_field_of_view, load_calibration
 
 CAMERA = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05))
 FISHEYE = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, (0.01, -0.02, 0.003, 0.0004), "fisheye")

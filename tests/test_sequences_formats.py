@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from improvo.geometry.camera_files import calibration_yaml
 from improvo.geometry.se3 import inverse, rigid
 from improvo.sequences import SequenceSettings, open_recording, open_sequence
-from improvo.sequences.calibration import calibration_yaml
-from improvo.sequences.tum_rgbd import TumRgbdWriter
+from improvo.simulation.tum_writer import TumRgbdWriter
 from improvo.types import Trajectory
 from sequence_builders import CAMERA, depths, images, poses, write_images, write_tum
 

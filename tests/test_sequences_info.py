@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from improvo.cli.main import main
+from improvo.geometry.camera_files import calibration_yaml
 from improvo.sequences import SequenceSettings
-from improvo.sequences.calibration import calibration_yaml
 from improvo.sequences.survey import Survey, survey
 from improvo.types import UInt8
 from sequence_builders import CAMERA, images, texture, write_images, write_tum, write_video

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from improvo.errors import ConfigError, InputError
+from improvo.geometry.camera_files import Calibration
 from improvo.sequences import Recording, SequenceSettings, open_sequence, opening
 from improvo.sequences.base import UnreadableFrameError
-from improvo.sequences.calibration import Calibration
 from improvo.types import UInt8
 
 

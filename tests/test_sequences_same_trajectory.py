@@ -11,8 +11,8 @@ import pytest
 import ros_encoders
 import sequence_encoders as encoders
 from improvo.cli.main import main
+from improvo.geometry.camera_files import calibration_yaml
 from improvo.sequences import open_sequence, read_trajectory
-from improvo.sequences.calibration import calibration_yaml
 from sequence_builders import write_video
 from sequence_encoders import Scene
 

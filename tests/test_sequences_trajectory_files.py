@@ -9,8 +9,8 @@ import pytest
 
 from improvo.errors import InputError
 from improvo.geometry.se3 import quat_xyzw_from_rotation, rotation_angle_deg
+from improvo.geometry.trajectory_files import clean_poses, read_trajectory_report
 from improvo.sequences import read_trajectory, write_trajectory
-from improvo.sequences.trajectory_files import clean_poses, read_trajectory_report
 from improvo.types import Trajectory
 from sequence_builders import poses
 

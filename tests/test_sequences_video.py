@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from improvo.errors import InputError
+from improvo.geometry.camera_files import calibration_yaml
 from improvo.sequences import open_sequence
-from improvo.sequences.calibration import calibration_yaml
 from sequence_builders import CAMERA, images, write_video
 
 COUNT = 60

@@ -11,8 +11,8 @@ import pytest
 
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
+from improvo.geometry.camera_files import calibration_yaml
 from improvo.sequences import open_sequence
-from improvo.sequences.calibration import calibration_yaml
 from improvo.sequences.rectification import Rectifier
 from sequence_builders import CAMERA, images, write_images
 

@@ -17,7 +17,7 @@ from improvo.frontend.architecture import Architecture  # noqa: E402
 from improvo.frontend.superpoint import SuperPoint, sample_stability  # noqa: E402
 from improvo.frontend.weights import ModelCard, load_weights, save_weights  # noqa: E402
 from improvo.labeling.labelled import read_labels  # noqa: E402
-from improvo.labeling.stability import IGNORE, STABLE, UNSTABLE  # noqa: E402
+from improvo.stability.rule import IGNORE, STABLE, UNSTABLE  # noqa: E402
 from improvo.training.labelled_frames import LabelledFrames, common_points  # noqa: E402
 from improvo.training.labels import IGNORED  # noqa: E402
 from improvo.training.losses import info_nce_loss, stability_loss  # noqa: E402

@@ -7,9 +7,13 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from improvo.errors import OutputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 MARKER = ".improvo.json"
 FORMER_NAME = "sivo"  # of this package; folders and weights written under it stay readable
@@ -37,6 +41,16 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, data: Any) -> None:
     """Write JSON atomically, indented, with NaN refused (use None)."""
     write_text(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
+
+
+def write_png(path: Path, rgb: NDArray[np.uint8]) -> None:
+    """Write a picture (H, W, 3) RGB."""
+    import cv2
+    import numpy as np
+
+    with written_atomically(path) as temporary:
+        if not cv2.imwrite(str(temporary), np.ascontiguousarray(rgb[..., ::-1])):
+            raise OutputError(f"{path}: cannot be written; choose another folder")
 
 
 def check_output_folder(path: Path, command: str) -> None:

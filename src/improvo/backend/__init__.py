@@ -1,39 +1,24 @@
-"""Bundle adjustment: the paper's objective, its solver, and triangulation with the poses held.
+"""Bundle adjustment: the paper's objective and its solver.
 
-Light to import; the compiled kernels load with the first use of `solve` and its like.
+Light to import; the compiled kernels load with the first use of `solve`.
 """
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
 
 from improvo.backend.problem import BundleProblem, BundleResult
-from improvo.backend.settings import ObjectiveSettings, SolverSettings, TriangulationSettings
+from improvo.backend.settings import ObjectiveSettings, SolverSettings
 
 if TYPE_CHECKING:
     from improvo.backend.solver import solve
-    from improvo.backend.triangulation import Triangulation, triangulate_tracks
 
-_LAZY = {
-    "solve": "improvo.backend.solver",
-    "Triangulation": "improvo.backend.triangulation",
-    "triangulate_tracks": "improvo.backend.triangulation",
-}
-
-__all__ = [
-    "BundleProblem",
-    "BundleResult",
-    "ObjectiveSettings",
-    "SolverSettings",
-    "Triangulation",
-    "TriangulationSettings",
-    "solve",
-    "triangulate_tracks",
-]
+__all__ = ["BundleProblem", "BundleResult", "ObjectiveSettings", "SolverSettings", "solve"]
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name]), name)
+    if name == "solve":
+        from improvo.backend.solver import solve
+
+        return solve
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

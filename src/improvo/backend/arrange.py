@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from improvo.backend.compiled import compiled
 from improvo.backend.problem import BundleProblem
 from improvo.backend.settings import ObjectiveSettings
+from improvo.compiled import compiled
 from improvo.types import Float64, Int64
 
 POSE = 6  # parameters of a pose

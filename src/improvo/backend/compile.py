@@ -16,7 +16,8 @@ from improvo.backend.simulated import simulated_window
 
 def kernels_are_cached() -> bool:
     """Whether a compiled copy of the solver is on disk; it may still be stale, which only costs a compilation."""
-    from improvo.backend import reduced, triangulation_kernels
+    from improvo.backend import reduced
+    from improvo.geometry import triangulation_kernels
 
     kernels = (reduced.solve_step, triangulation_kernels.triangulate_all)
     folders = [kernel.stats.cache_path for kernel in kernels]  # None where nothing can be cached
@@ -35,7 +36,7 @@ def compile_kernels(progress: Callable[[str], None] | None = None) -> None:
     if progress is not None and not kernels_are_cached():
         progress("compiling the solver (once, about 15 s)")
     from improvo.backend.solver import solve
-    from improvo.backend.triangulation import triangulate_tracks
+    from improvo.geometry.triangulation import triangulate_tracks
 
     problem = simulated_window(cameras=4, points=6).problem
     solve(problem)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 from improvo.backend.arrange import CHUNK, COLUMN, POSE, STRIDE
-from improvo.backend.compiled import compiled
+from improvo.compiled import compiled
 
 
 @compiled

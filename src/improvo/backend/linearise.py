@@ -16,28 +16,8 @@ import math
 
 import numpy as np
 
-from improvo.backend.compiled import compiled, inlined
-from improvo.backend.objective import MIN_DEPTH
-
-_MIN_DEPTH = float(MIN_DEPTH)
-
-
-@inlined
-def point_in_camera(pose, point):
-    """R X + t as three numbers."""
-    return (
-        pose[0, 0] * point[0] + pose[0, 1] * point[1] + pose[0, 2] * point[2] + pose[0, 3],
-        pose[1, 0] * point[0] + pose[1, 1] * point[1] + pose[1, 2] * point[2] + pose[1, 3],
-        pose[2, 0] * point[0] + pose[2, 1] * point[1] + pose[2, 2] * point[2] + pose[2, 3],
-    )
-
-
-@inlined
-def inverse_depth(z):
-    """1 / Z, kept finite near the plane of the camera as in the reference objective."""
-    if abs(z) >= _MIN_DEPTH:
-        return 1.0 / z
-    return -1.0 / _MIN_DEPTH if z < 0.0 else 1.0 / _MIN_DEPTH
+from improvo.compiled import compiled, inlined
+from improvo.geometry.projection_kernels import inverse_depth, point_in_camera
 
 
 @inlined

@@ -20,9 +20,8 @@ import numpy as np
 
 from improvo.backend.problem import BundleProblem
 from improvo.backend.settings import ObjectiveSettings
+from improvo.geometry.camera import MIN_DEPTH
 from improvo.types import Float64
-
-MIN_DEPTH = 1e-6  # map units
 
 
 def points_in_cameras(problem: BundleProblem, cam_from_world: Float64, points: Float64) -> Float64:

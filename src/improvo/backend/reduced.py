@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 from improvo.backend.arrange import COLUMN, POSE, STRIDE
-from improvo.backend.compiled import compiled
 from improvo.backend.eliminate import back_substitute, block_start, chunk_end, subtract_rank_3
+from improvo.compiled import compiled
 
 
 @compiled

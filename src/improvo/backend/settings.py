@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 from improvo.errors import ConfigError
 
@@ -49,19 +48,3 @@ class SolverSettings:
             raise ConfigError("damping: needs 0 < min_damping <= initial_damping <= max_damping")
         if not self.min_diagonal > 0:
             raise ConfigError(f"min_diagonal={self.min_diagonal}: must be positive")
-
-
-@dataclass(frozen=True)
-class TriangulationSettings:
-    """How the points of tracks are found while the poses are held."""
-
-    loss: Literal["huber", "geman_mcclure"] = "huber"  # the second lets go of what does not fit (docs/labels.md)
-    loss_width: float = 1.0  # pixels
-    max_iterations: int = 10  # of the refinement by re-weighted least squares
-    min_parallax_deg: float = 1.0  # smallest angle between two of a point's rays for it to count as found
-
-    def __post_init__(self) -> None:
-        if self.loss not in ("huber", "geman_mcclure"):
-            raise ConfigError(f"triangulation loss={self.loss!r}: must be huber or geman_mcclure")
-        if not self.loss_width > 0:
-            raise ConfigError(f"triangulation loss_width={self.loss_width}: must be positive")

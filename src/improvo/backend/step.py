@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import math
 
-from improvo.backend.compiled import compiled
 from improvo.backend.linearise import evaluate
+from improvo.compiled import compiled
 
 
 @compiled

@@ -6,10 +6,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from improvo.errors import ConfigError
+from improvo.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
-    from improvo.sequences.camera_fit import CameraFit
+    from improvo.calibration.camera_fit import CameraFit
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Print the board, or calibrate and write `camera.yaml` and the coverage picture beside it."""
-    from improvo.sequences.board import parse_board, print_board
+    from improvo.calibration.board import parse_board, print_board
 
     board = parse_board(arguments.board)
     if arguments.print_board is not None:
@@ -55,8 +55,8 @@ def run(arguments: argparse.Namespace) -> None:
         raise ConfigError("--samples and --views must be at least 1")
     from tqdm import tqdm
 
-    from improvo.sequences.base import SequenceSettings
-    from improvo.sequences.calibration_run import calibrate, write_camera, write_coverage
+    from improvo.calibration.from_board import calibrate, write_camera, write_coverage
+    from improvo.sequences.base import SequenceSettings, sampled_pictures
     from improvo.sequences.opening import open_recording
 
     settings = SequenceSettings(format=arguments.format, topic=arguments.topic)
@@ -70,7 +70,11 @@ def run(arguments: argparse.Namespace) -> None:
             bar.update()
             bar.set_postfix(found=found, refresh=False)
 
-        fit = calibrate(recording, board, arguments.model, arguments.samples, arguments.views, progress)
+        pictures = sampled_pictures(recording, arguments.samples)
+        try:
+            fit = calibrate(pictures, board, arguments.model, arguments.views, progress)
+        except InputError as error:
+            raise InputError(f"{recording.path}: {error}") from None
     picture = arguments.output.with_name(f"{arguments.output.stem}-coverage.png")
     write_camera(arguments.output, fit)
     write_coverage(picture, fit)

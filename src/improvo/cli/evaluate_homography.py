@@ -51,11 +51,11 @@ def run(arguments: argparse.Namespace) -> int | None:
     """Print the table; with -o leave homography.json and homography.md."""
     from improvo import __version__
     from improvo.cli.evaluate_options import loaded_frontends
-    from improvo.evaluation.homography import run_homography_protocol
-    from improvo.evaluation.homography_pairs import hpatches_scenes, picture_scenes
-    from improvo.evaluation.parallel import Workers
+    from improvo.evaluation.homography.pairs import hpatches_scenes, picture_scenes
+    from improvo.evaluation.homography.protocol import run_homography_protocol
     from improvo.evaluation.tables import homography_table
     from improvo.files import make_output_folder, write_json, write_text
+    from improvo.jobs.pool import Workers
 
     settings = settings_from(HomographyCommandSettings, arguments, _FLAGS).homography
     if (arguments.folder is None) == (arguments.synthesize is None):

@@ -81,7 +81,7 @@ def exported_features(asked: list[str], max_keypoints: int, one_sequence: bool) 
     Raises:
         InputError: nothing exported there.
     """
-    from improvo.evaluation.exported import ExportedFeatures
+    from improvo.evaluation.frontends.exported import ExportedFeatures
 
     found: list[FeatureSource] = []
     for text in asked:

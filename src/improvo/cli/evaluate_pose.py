@@ -106,10 +106,10 @@ def read_results(path: Path) -> dict[str, Any]:
 def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     from improvo import __version__
     from improvo.cli.evaluate_options import exported_features, loaded_frontends
-    from improvo.evaluation.parallel import Workers
-    from improvo.evaluation.pose_results import results, write_records
-    from improvo.evaluation.pose_run import run_pose_protocol
+    from improvo.evaluation.pose.results import results, write_records
+    from improvo.evaluation.pose.run import run_pose_protocol
     from improvo.files import make_output_folder, write_json
+    from improvo.jobs.pool import Workers
 
     settings, sources = _settings(arguments)
     output: Path | None = arguments.output
@@ -182,7 +182,7 @@ def _export(arguments: argparse.Namespace) -> int:
     """Write the frames that the evaluation will use, as delivered, for a frontend that runs elsewhere."""
     import cv2
 
-    from improvo.evaluation.pairs import pairs_of_sequence
+    from improvo.evaluation.pose.pairs import pairs_of_sequence
     from improvo.files import make_output_folder, written_atomically
 
     make_output_folder(arguments.export_images, f"{COMMAND} --export-images")

@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Print the table; with -o leave stability.json, stability.md and stability.png."""
     from improvo import __version__
     from improvo.errors import ConfigError
-    from improvo.evaluation.stability import (
+    from improvo.evaluation.stability.protocol import (
         Judged,
         judge_frontend,
         judge_labels,
@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     text = stability_table(results)
     print(text)
     if arguments.output is not None:
-        from improvo.evaluation.stability_plot import draw_stability
+        from improvo.evaluation.stability.plot import draw_stability
 
         make_output_folder(arguments.output, COMMAND)
         write_json(arguments.output / "stability.json", results)

@@ -70,8 +70,8 @@ def add_trajectory_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int | None:
     """Print the tables; with -o leave trajectory.json and trajectory.md."""
     from improvo.config import to_dict
-    from improvo.evaluation.trajectory import evaluate_trajectory
-    from improvo.evaluation.trajectory_tables import trajectory_tables
+    from improvo.evaluation.trajectory.protocol import evaluate_trajectory
+    from improvo.evaluation.trajectory.tables import trajectory_tables
     from improvo.files import make_output_folder, write_json, write_text
 
     command = settings_from(TrajectoryCommandSettings, arguments, TRAJECTORY_FLAGS)
@@ -104,8 +104,8 @@ def read_pair(
     Raises:
         InputError: a file that is no trajectory, a folder without one, a sequence without true poses.
     """
+    from improvo.geometry.trajectory_files import read_trajectory_report
     from improvo.sequences import open_sequence
-    from improvo.sequences.trajectory_files import read_trajectory_report
     from improvo.types import Trajectory
 
     if truth_path.is_dir():

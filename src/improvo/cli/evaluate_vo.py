@@ -44,11 +44,11 @@ def run(arguments: argparse.Namespace) -> int | None:
     from improvo import __version__
     from improvo.cli.evaluate_options import loaded_frontends
     from improvo.config import to_dict
-    from improvo.evaluation.parallel import Workers
     from improvo.evaluation.sources import Recorded
-    from improvo.evaluation.trajectory_tables import vo_tables
-    from improvo.evaluation.vo import evaluate_vo
+    from improvo.evaluation.trajectory.tables import vo_tables
+    from improvo.evaluation.vo.protocol import evaluate_vo
     from improvo.files import make_output_folder, write_json, write_text
+    from improvo.jobs.pool import Workers
     from improvo.sequences import write_trajectory
 
     settings = settings_from(VoCommandSettings, arguments, _FLAGS)

@@ -25,10 +25,10 @@ def add_model_arguments(parser: argparse.ArgumentParser, contents: str) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the model of every segment, the longest first."""
+    from improvo.export.colmap import write_colmap
+    from improvo.export.model import segment_model, segments_by_length, write_images
     from improvo.files import make_output_folder
-    from improvo.report.colmap import write_colmap
-    from improvo.report.model import segment_model, segments_by_length, write_images
-    from improvo.report.run_folder import RunFolder
+    from improvo.odometry.run_folder import RunFolder
 
     run_folder = RunFolder(arguments.folder, arguments.sequence)
     segments = segments_by_length(run_folder)

@@ -14,10 +14,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the longest segment; one scene has one world."""
+    from improvo.export.model import segment_model, segments_by_length, write_images
+    from improvo.export.nerfstudio import write_nerfstudio
     from improvo.files import make_output_folder
-    from improvo.report.model import segment_model, segments_by_length, write_images
-    from improvo.report.nerfstudio import write_nerfstudio
-    from improvo.report.run_folder import RunFolder
+    from improvo.odometry.run_folder import RunFolder
 
     run_folder = RunFolder(arguments.folder, arguments.sequence)
     segments = segments_by_length(run_folder)

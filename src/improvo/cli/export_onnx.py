@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the file."""
-    from improvo.frontend.onnx_export import export_onnx
+    from improvo.export.onnx import export_onnx
     from improvo.frontend.weights import find_weights, load_weights
 
     settings = NetworkSettings(

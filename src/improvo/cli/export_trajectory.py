@@ -16,8 +16,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Write the file."""
     from improvo.cli.show_options import target_path
-    from improvo.report.run_folder import RunFolder
-    from improvo.report.trajectory_export import export_trajectory
+    from improvo.export.trajectory import export_trajectory
+    from improvo.odometry.run_folder import RunFolder
 
     run_folder = RunFolder(arguments.folder)
     name = {"tum": "trajectory.txt", "kitti": "poses.txt", "euroc": "data.csv"}[arguments.format]

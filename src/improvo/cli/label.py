@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = settings_from(LabelRunSettings, arguments, FRONTEND_FLAGS | {"max_stray": "odometry.matching.max_stray"})
     from tqdm import tqdm
 
-    from improvo.improvement.labelling import label_sequences
+    from improvo.labeling.label_sequences import label_sequences
     from improvo.labeling.store import DONE, SequenceRecord
     from improvo.odometry.compile import compile_odometry
 

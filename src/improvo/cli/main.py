@@ -13,7 +13,8 @@ from improvo import __version__
 from improvo.errors import ImprovoError
 
 # verb -> (module under improvo.cli, help line). A module has `add_arguments(parser)` and `run(arguments)`, which
-# returns int or None; a verb with its own sub-commands adds them with `parser.add_subparsers`. Heavy imports belong inside `run`.
+# returns int or None; a verb with its own sub-commands adds them with `parser.add_subparsers`. Heavy imports belong
+# inside `run`.
 COMMANDS: dict[str, tuple[str, str]] = {
     "label": ("label", "stability labels for many sequences: odometry, then the paper's rule"),
     "improve": ("improve", "the main job: label video, train the frontend with the labels, keep it if it got better"),

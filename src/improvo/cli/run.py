@@ -19,7 +19,7 @@ from improvo.odometry.run_settings import RunSettings
 if TYPE_CHECKING:
     from improvo.odometry.run import RunSummary
     from improvo.odometry.view import View
-    from improvo.odometry.viewer import Viewer
+    from improvo.odometry.visualizer import Viewer
     from improvo.sequences import Sequence
 
 _FLAGS = {**FRONTEND_FLAGS, "initialisation": "odometry.initialisation"}

@@ -11,7 +11,7 @@ from improvo.cli.options import add_config_arguments, add_sequence_arguments
 from improvo.errors import InputError
 
 if TYPE_CHECKING:
-    from improvo.report.run_folder import RunFolder
+    from improvo.odometry.run_folder import RunFolder
     from improvo.report.track_pictures import FramePainter
 
 _FRAME_PICTURES = {
@@ -99,9 +99,9 @@ def run(arguments: argparse.Namespace) -> None:
 def show_map(arguments: argparse.Namespace) -> None:
     """`improvo show map`."""
     from improvo.cli.show_options import target_path
+    from improvo.odometry.run_folder import RunFolder
     from improvo.report.map_picture import draw_map
     from improvo.report.palettes import palette
-    from improvo.report.run_folder import RunFolder
 
     run_folder = RunFolder(arguments.folder)
     target = target_path(arguments.output, arguments.folder / "pictures", "map.png")
@@ -114,9 +114,9 @@ def show_frames(arguments: argparse.Namespace) -> None:
     from functools import partial
 
     from improvo.cli.show_options import chosen_positions, recorded_fps, write_pictures
+    from improvo.odometry.run_folder import RunFolder
     from improvo.report import track_pictures
     from improvo.report.palettes import palette
-    from improvo.report.run_folder import RunFolder
 
     settings = track_pictures.TrackPictureSettings(palette=palette(arguments.palette))
     painters: dict[str, FramePainter] = {
@@ -162,10 +162,10 @@ def show_matches(arguments: argparse.Namespace) -> None:
     import numpy as np
 
     from improvo.cli.show_options import chosen_positions, opened_sequence, target_path
+    from improvo.files import write_png
     from improvo.frontend.registry import load_frontend
     from improvo.report.match_picture import paint_matches
     from improvo.report.palettes import palette
-    from improvo.report.sheets import write_png
 
     sequence, _ = opened_sequence(arguments)
     pair = chosen_positions(arguments.pair, len(sequence))
@@ -191,9 +191,9 @@ def show_matches(arguments: argparse.Namespace) -> None:
 
 def show_live(arguments: argparse.Namespace) -> None:
     """`improvo show live`."""
+    from improvo.odometry.run_folder import RunFolder
     from improvo.report.palettes import palette
     from improvo.report.rerun_viewer import show_run
-    from improvo.report.run_folder import RunFolder
 
     run_folder = RunFolder(arguments.folder, arguments.sequence)
     show_run(run_folder, arguments.output, palette(arguments.palette), images=not arguments.no_images)

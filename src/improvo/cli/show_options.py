@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from improvo.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
-    from improvo.report.run_folder import RunFolder
+    from improvo.odometry.run_folder import RunFolder
     from improvo.sequences import Sequence
     from improvo.types import UInt8
 
@@ -70,8 +70,8 @@ def recorded_fps(run_folder: RunFolder) -> float:
 def opened_sequence(arguments: argparse.Namespace) -> tuple[Sequence, str | None]:
     """The sequence of a command that takes a recording or the output folder of a run, and the run's frontend."""
     from improvo.cli.options import settings_from
+    from improvo.odometry.run_folder import RunFolder
     from improvo.odometry.run_settings import RunSettings
-    from improvo.report.run_folder import RunFolder
     from improvo.sequences import open_sequence
 
     path: Path = arguments.sequence
@@ -91,7 +91,8 @@ def write_pictures(
     """The pictures of the chosen frames as one sheet, one PNG each, or a video, as the arguments say."""
     from tqdm import tqdm
 
-    from improvo.report.sheets import write_png, write_sheet, write_video
+    from improvo.files import write_png
+    from improvo.report.sheets import write_sheet, write_video
 
     name = arguments.picture
     pictures = (paint(p) for p in tqdm(positions, unit="frame", desc=name, disable=len(positions) < _MANY))

@@ -65,7 +65,7 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     import cv2
     from tqdm import tqdm
 
-    from improvo.frontend.calibration import calibrate
+    from improvo.frontend.quantisation import calibrate
     from improvo.frontend.weights import find_weights, load_weights, save_weights
 
     output = _checked_output(arguments.output)

@@ -123,7 +123,7 @@ def best(features: Features, count: int) -> Features:
 @lru_cache(maxsize=8)
 def _load(name: str, max_keypoints: int, options: tuple[tuple[str, Any], ...]) -> Frontend:
     if name in PEERS:
-        from improvo.evaluation.peers import load_peer
+        from improvo.evaluation.frontends.peers import load_peer
 
         return load_peer(name, max_keypoints)
     from improvo.frontend.registry import load_frontend

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 from improvo.errors import ConfigError
-from improvo.frontend.live_channels import without_dead_channels
+from improvo.frontend.channel_pruning import without_dead_channels
 from improvo.frontend.settings import NetworkSettings
 from improvo.frontend.weights import Weights
 from improvo.types import Float32

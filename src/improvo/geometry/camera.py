@@ -9,6 +9,8 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.types import Float64
 
+MIN_DEPTH = 1e-6  # map units; nearer to the plane of the camera a projection has no value
+
 # distortion model -> the numbers of coefficients it may have
 DISTORTION_MODELS = {"brown": (0, 4, 5, 8), "fisheye": (4,), "fov": (1,)}
 

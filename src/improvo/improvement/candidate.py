@@ -75,7 +75,7 @@ def starting_weights(name: str) -> Path:
 
 def write_calibrated(source: Path, target: Path, images: Sequence[UInt8]) -> None:
     """Copy weights with activation ranges over the images, so that they run in int8 where that can run them at all."""
-    from improvo.frontend.calibration import calibrate
+    from improvo.frontend.quantisation import calibrate
 
     weights = load_weights(source)
     if weights.architecture.normalisation != "after_relu":  # int8 has no negative activations

@@ -54,7 +54,7 @@ def improve(
         settings: all of them; `settings.frontend.name` is where the loop starts.
         rounds: of labelling, training and judging.
         evaluate: recordings to hold back; without any, some of `sequences`, or the last part of a single one.
-        workers, ray: who labels many sequences, see `improvo.improvement.labelling.label_sequences`.
+        workers, ray: who labels many sequences, see `improvo.labeling.label_sequences.label_sequences`.
         data: what the model card says about the recordings.
         telling: shows progress and results.
         train: in place of `improvo.training.stages.train_odometry`.

@@ -10,20 +10,20 @@ from pathlib import Path
 import numpy as np
 
 from improvo.errors import InputError
-from improvo.evaluation.pairs import draw_pairs
-from improvo.evaluation.parallel import Workers
+from improvo.evaluation.pose.pairs import draw_pairs
+from improvo.evaluation.pose.unlabelled import Survival, surviving_matches, usable_gaps
 from improvo.evaluation.settings import PoseSettings
 from improvo.evaluation.sources import LoadedFrontend, Recorded
-from improvo.evaluation.trajectory import clean_truth
-from improvo.evaluation.unlabelled import Survival, surviving_matches, usable_gaps
+from improvo.evaluation.trajectory.protocol import clean_truth
 from improvo.improvement.candidate import Candidate
 from improvo.improvement.held_back import Part
 from improvo.improvement.judgement import Judgement, write_judgement
 from improvo.improvement.settings import JudgeSettings
+from improvo.jobs.pool import Workers
 from improvo.labeling.labelled import LabelledSequence, read_labels
-from improvo.labeling.stability import IGNORE
 from improvo.labeling.store import DONE, SequenceRecord
 from improvo.sequences import Sequence, open_sequence
+from improvo.stability.rule import IGNORE
 
 
 def judge(
@@ -112,8 +112,8 @@ def _pose_success(
     progress: bool,
 ) -> dict[str, float]:
     """Success rates of the pose protocol over the recordings that have depth and true poses; empty without any."""
-    from improvo.evaluation.pose_results import results
-    from improvo.evaluation.pose_run import run_pose_protocol
+    from improvo.evaluation.pose.results import results
+    from improvo.evaluation.pose.run import run_pose_protocol
 
     survival = settings.survival
     frontend = LoadedFrontend(str(candidate.weights), survival.max_keypoints, label=candidate.name)

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from improvo.errors import InputError
-from improvo.evaluation.unlabelled import spread_pairs
+from improvo.evaluation.pose.unlabelled import spread_pairs
+from improvo.files import write_png
 from improvo.frontend.weights import load_weights
 from improvo.improvement.candidate import Candidate, training_losses
 from improvo.improvement.held_back import Part, Split
@@ -15,7 +16,6 @@ from improvo.improvement.settings import ImproveSettings
 from improvo.improvement.telling import gain_words
 from improvo.labeling.store import DONE, read_records
 from improvo.report.improvement_page import Measure, Round, write_improvement_page
-from improvo.report.sheets import write_png
 from improvo.sequences import open_sequence
 
 _LOSSES = ("loss", "detector", "descriptor", "stability")
@@ -212,7 +212,7 @@ def _draw_stability(
 def _draw_labels(
     target: Path, candidate: Candidate, part: Part, judgement: Judgement, settings: ImproveSettings
 ) -> None:
-    from improvo.report.run_folder import RunFolder
+    from improvo.odometry.run_folder import RunFolder
     from improvo.report.track_pictures import TrackPictureSettings, paint_labels
 
     done = [record for record in read_records(candidate.held_back) if record.state == DONE]

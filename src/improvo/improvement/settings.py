@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 from improvo.errors import ConfigError
 from improvo.evaluation.settings import SurvivalSettings
-from improvo.labeling.settings import LabelSettings
 from improvo.odometry.run_settings import FrontendSettings, RunSettings
 from improvo.odometry.settings import OdometrySettings
 from improvo.sequences.base import SequenceSettings
+from improvo.stability.settings import LabelSettings
 from improvo.training.settings import OdometryTrainingSettings, OptimiserSettings
 
 DEFAULT_START = "superpoint"

@@ -17,10 +17,10 @@ from improvo.improvement.candidate import Candidate, calibration_images, write_c
 from improvo.improvement.held_back import Part, Split, last_part, named, remembered, share_labels, whole_sequences
 from improvo.improvement.judge import judge
 from improvo.improvement.judgement import Judgement, read_judgement
-from improvo.improvement.labelling import label_sequences
 from improvo.improvement.settings import ImproveSettings
 from improvo.improvement.telling import Telling
 from improvo.improvement.workspace import Workspace
+from improvo.labeling.label_sequences import label_sequences
 from improvo.labeling.store import DONE, SequenceRecord, read_records
 from improvo.sequences import SequenceSettings, open_sequence
 from improvo.training.settings import OdometryTrainingSettings
@@ -52,7 +52,7 @@ class Steps:
         train: what teaches.
         data: what the model card says about the recordings.
         workers: sequences that are labelled at a time.
-        ray: address of a Ray cluster that labels them, see `improvo.improvement.on_ray`.
+        ray: address of a Ray cluster that labels them, see `improvo.jobs.on_ray`.
         telling: shows progress and results.
     """
 

@@ -16,10 +16,10 @@ from improvo.errors import InputError
 from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import inverse
 from improvo.labeling.frames import FRAMES_FILE, FramesTable, PackedImages, read_frames
-from improvo.labeling.settings import LabelSettings
 from improvo.labeling.store import DONE, SETTINGS_FILE, SequenceRecord, read_records
-from improvo.labeling.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
 from improvo.sequences.base import SequenceSettings
+from improvo.stability.settings import LabelSettings
+from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
 from improvo.types import Float64, UInt8
 
 RUN_FILE, TRAJECTORY_FILE = "run.json", "trajectory.txt"

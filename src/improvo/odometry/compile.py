@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from improvo.backend.compile import compile_kernels
-from improvo.odometry.refind import match_by_projection
+from improvo.odometry.projection_search import match_by_projection
 from improvo.tracking.matching import match_units
 
 

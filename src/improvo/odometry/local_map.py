@@ -8,10 +8,10 @@ from collections.abc import Iterable
 import numpy as np
 import poselib
 
-from improvo.backend.triangulation import triangulate_tracks
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.odometry.refind import match_by_projection
+from improvo.geometry.triangulation import triangulate_tracks
+from improvo.odometry.projection_search import match_by_projection
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_points, trusted
 from improvo.tracking.matching import match_units

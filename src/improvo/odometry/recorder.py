@@ -9,10 +9,10 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.labeling.settings import LabelSettings
-from improvo.labeling.stability import label_stability
-from improvo.labeling.tables import POINTS_FILE, TRACKS_FILE, PointsWriter, TracksWriter
 from improvo.odometry.journal import FinalView
+from improvo.stability.rule import label_stability
+from improvo.stability.settings import LabelSettings
+from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsWriter, TracksWriter
 from improvo.types import Float64, Int64, Tracks
 
 _FLUSH_EVERY = 200  # final frames

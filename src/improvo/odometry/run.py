@@ -27,8 +27,8 @@ from improvo.odometry.ply import write_ply
 from improvo.odometry.recorder import TrackRecorder
 from improvo.odometry.run_settings import RunSettings
 from improvo.odometry.view import View
-from improvo.odometry.viewer import NullViewer, Viewer
 from improvo.odometry.visual_odometry import VisualOdometry
+from improvo.odometry.visualizer import NullViewer, Viewer
 from improvo.sequences import Sequence, write_trajectory
 from improvo.types import Trajectory
 

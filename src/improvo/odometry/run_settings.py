@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from improvo.errors import ConfigError
-from improvo.labeling.settings import LabelSettings
 from improvo.odometry.settings import OdometrySettings
 from improvo.sequences.base import SequenceSettings
+from improvo.stability.settings import LabelSettings
 
 DEFAULT_FRONTEND = "superpoint-vo"
 

@@ -9,9 +9,9 @@ import numpy as np
 import poselib
 
 from improvo.backend.settings import SolverSettings
-from improvo.backend.triangulation import triangulate_tracks
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
+from improvo.geometry.triangulation import triangulate_tracks
 from improvo.odometry.local_map import LocalMap, poselib_camera
 from improvo.odometry.settings import OdometrySettings, StartSettings
 from improvo.odometry.view import NO_POINT, View, common_tracks, trusted_pairs

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from improvo.labeling.store import DONE, read_records
+from improvo.odometry.run_folder import RunFolder
 from improvo.report.map_picture import draw_map
 from improvo.report.page import Page
 from improvo.report.palettes import PALETTES, Palette
 from improvo.report.plain_words import warnings
-from improvo.report.run_folder import RunFolder
 
 _MAX_MAPS = 12
 _COLUMNS = (

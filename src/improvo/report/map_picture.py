@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.files import written_atomically
+from improvo.odometry.run_folder import RunFolder
 from improvo.report.overhead import overhead_axes, robust_limits
 from improvo.report.palettes import PALETTES, Palette
-from improvo.report.run_folder import RunFolder
 from improvo.types import SparseMap
 
 _BACKGROUND = "#565b63"  # neither the paper's black (last window) nor its white (points)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from improvo.evaluation.depth import depth_at
-from improvo.evaluation.estimators import with_poselib
+from improvo.evaluation.pose.estimators import with_poselib
 from improvo.frontend import Frontend
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from improvo.errors import InputError
-from improvo.labeling.stability import IGNORE
+from improvo.odometry.run_folder import RunFolder
 from improvo.report.map_picture import trusted_points
 from improvo.report.overhead import overhead_axes, robust_limits
 from improvo.report.palettes import Palette
-from improvo.report.run_folder import RunFolder
+from improvo.stability.rule import IGNORE
 from improvo.types import Float64, UInt8
 
 _MAX_POINTS = 40_000  # of a layer; more make the page heavy, not the picture clearer

@@ -23,7 +23,7 @@ def write_report(
         InputError: the folder has no results that a page can be made of.
     """
     if (folder / "run.json").is_file():
-        from improvo.report.run_folder import RunFolder
+        from improvo.odometry.run_folder import RunFolder
         from improvo.report.run_page import write_run_page
 
         write_run_page(RunFolder(folder, sequence_path), path, palette)

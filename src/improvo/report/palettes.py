@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from improvo.errors import ConfigError
-from improvo.labeling.stability import IGNORE, STABLE, UNSTABLE
+from improvo.stability.rule import IGNORE, STABLE, UNSTABLE
 from improvo.types import UInt8
 
 if TYPE_CHECKING:

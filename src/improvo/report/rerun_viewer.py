@@ -16,10 +16,10 @@ from improvo.errors import MissingExtraError, OutputError
 from improvo.files import written_atomically
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.labeling.stability import IGNORE
+from improvo.odometry.run_folder import RunFolder
 from improvo.odometry.view import View
 from improvo.report.palettes import PALETTES, Palette
-from improvo.report.run_folder import RunFolder
+from improvo.stability.rule import IGNORE
 from improvo.types import Float64, Frame, UInt8
 
 _OLD = 30  # frames; the last colour of the age of a track
@@ -27,7 +27,7 @@ _MAP_EVERY = 10  # frames between two pictures of the whole map
 
 
 class RerunViewer:
-    """An `improvo.odometry.viewer.Viewer` that shows a run in Rerun.
+    """An `improvo.odometry.visualizer.Viewer` that shows a run in Rerun.
 
     Args:
         save: a `.rrd` file to write, which works without a screen; None opens the viewer.

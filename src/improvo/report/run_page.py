@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from improvo.errors import InputError
+from improvo.odometry.run_folder import RunFolder
 from improvo.report.charts import line_chart
 from improvo.report.map_picture import draw_map
 from improvo.report.page import Page
 from improvo.report.page_data import frames_data, per_frame, scene_data
 from improvo.report.palettes import PALETTES, Palette
 from improvo.report.plain_words import warnings
-from improvo.report.run_folder import RunFolder
 
 _MAX_FRAMES = 150  # of the slider
 _FRAME_WIDTH = 480

@@ -8,21 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from improvo.errors import OutputError
-from improvo.files import written_atomically
+from improvo.files import write_png, written_atomically
 from improvo.report.canvas import stacked
 from improvo.types import UInt8
 
 # Codecs that OpenCV's wheels can write into MP4: VP9 plays in browsers, MPEG-4 is the fallback.
 _CODECS = ("vp09", "mp4v")
-
-
-def write_png(path: Path, rgb: UInt8) -> None:
-    """Write a picture (H, W, 3) RGB."""
-    import cv2
-
-    with written_atomically(path) as temporary:
-        if not cv2.imwrite(str(temporary), np.ascontiguousarray(rgb[..., ::-1])):
-            raise OutputError(f"{path}: cannot be written; choose another folder")
 
 
 def write_sheet(path: Path, pictures: Sequence[UInt8], columns: int | None = None) -> None:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from improvo.labeling.stability import IGNORE, STABLE, UNSTABLE
+from improvo.odometry.run_folder import RunFolder
 from improvo.report.canvas import Canvas
 from improvo.report.palettes import PALETTES, Palette
-from improvo.report.run_folder import RunFolder
+from improvo.stability.rule import IGNORE, STABLE, UNSTABLE
 from improvo.types import Float32, Int64, UInt8
 
 _JUMP_SHARE = 0.03  # of the image width; shorter links are never called a jump

@@ -10,10 +10,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from improvo.geometry.trajectory_files import read_trajectory, write_trajectory
     from improvo.sequences.base import Recording, SequenceSettings, SkippedFrame
     from improvo.sequences.opening import open_recording, open_sequence
     from improvo.sequences.sequence import Sequence
-    from improvo.sequences.trajectory_files import read_trajectory, write_trajectory
 
 _PUBLIC = {
     "open_sequence": "opening",

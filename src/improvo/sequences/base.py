@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from improvo.sequences.calibration import Calibration
+import numpy as np
+
+from improvo.geometry.camera_files import Calibration
 from improvo.types import Float32, Float64, Trajectory, UInt8
 
 
@@ -72,6 +75,18 @@ class Recording(ABC):
     def depth(self, index: int) -> Float32 | None:
         """Depth in metres (H, W) registered to the raw image, NaN where missing; None where there is none."""
         return None
+
+
+def sampled_pictures(recording: Recording, samples: int) -> Iterator[tuple[str, UInt8]]:
+    """Source and grey picture (H, W) of up to `samples` frames that can be read, spread over the recording."""
+    from improvo.sequences.images import grey
+
+    rows = np.unique(np.linspace(0, len(recording) - 1, min(samples, len(recording))).astype(int))
+    for row in rows.tolist():
+        try:
+            yield recording.source(row), grey(recording.image(row))
+        except UnreadableFrameError:  # noqa: PERF203 - any frame may be damaged
+            continue
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from improvo.errors import InputError
+from improvo.geometry.camera_files import Calibration, load_calibration, parse_yaml
 from improvo.geometry.se3 import inverse
+from improvo.geometry.trajectory_files import clean_poses, increasing_order, read_trajectory_report
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.calibration import Calibration, load_calibration, parse_yaml
 from improvo.sequences.images import list_images, read_image
-from improvo.sequences.trajectory_files import clean_poses, increasing_order, read_trajectory_report
 from improvo.types import Float64, Trajectory, UInt8
 
 _TRUTH = ("state_groundtruth_estimate0", "vicon0", "mocap0")

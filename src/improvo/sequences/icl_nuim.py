@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from improvo.errors import InputError
+from improvo.geometry.camera_files import Calibration, folder_calibration
+from improvo.geometry.trajectory_files import read_trajectory_report
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.calibration import Calibration, folder_calibration
 from improvo.sequences.images import list_images, read_depth, read_image
-from improvo.sequences.trajectory_files import read_trajectory_report
 from improvo.types import Float32, Trajectory, UInt8
 
 DEPTH_SCALE = 5000.0

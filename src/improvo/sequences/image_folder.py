@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from improvo.errors import InputError
+from improvo.geometry.camera_files import Calibration, folder_calibration, load_calibration
+from improvo.geometry.trajectory_files import increasing_order, read_times, read_trajectory_report
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.calibration import Calibration, folder_calibration, load_calibration
 from improvo.sequences.images import list_images, read_image
-from improvo.sequences.trajectory_files import increasing_order, read_times, read_trajectory_report
 from improvo.types import Float64, UInt8
 
 DEFAULT_FPS = 30.0

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from improvo.errors import InputError
+from improvo.geometry.camera_files import Calibration
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.calibration import Calibration
 from improvo.sequences.image_folder import frame_rate
 from improvo.sequences.images import natural_key, read_depth, read_image
 from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl

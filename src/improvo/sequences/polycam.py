@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 from improvo.errors import InputError
+from improvo.geometry.trajectory_files import increasing_order
 from improvo.sequences.base import Recording, SequenceSettings
 from improvo.sequences.images import list_images, read_depth, read_image
-from improvo.sequences.trajectory_files import increasing_order
 from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
 from improvo.types import Float32, UInt8
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import inverse, transform
-from improvo.sequences.trajectory_files import clean_poses
+from improvo.geometry.trajectory_files import clean_poses
 from improvo.types import Float32, Float64
 
 

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from improvo.errors import InputError
+from improvo.geometry.camera_files import Calibration
+from improvo.geometry.trajectory_files import increasing_order
 from improvo.sequences import ros_messages
 from improvo.sequences.association import nearest
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.calibration import Calibration
 from improvo.sequences.ros_topics import Stream, candidates, deserialized, guarded, open_reader
-from improvo.sequences.trajectory_files import increasing_order
 from improvo.types import Float32, Int64, Trajectory, UInt8
 
 _TRUTH_NAME = re.compile(r"ground.?truth|(^|[/_])gt([/_]|$)|vicon|mocap|optitrack|leica", re.IGNORECASE)

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from improvo.errors import InputError
+from improvo.geometry.camera_files import MODEL_NAMES, Calibration, usual_length
 from improvo.geometry.se3 import rigid, rotation_from_quat_xyzw
 from improvo.sequences.base import UnreadableFrameError
-from improvo.sequences.calibration import MODEL_NAMES, Calibration, usual_length
 from improvo.sequences.images import decode, depth_in_metres
 from improvo.types import Float32, Float64, UInt8
 

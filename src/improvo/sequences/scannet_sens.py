@@ -17,11 +17,11 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
+from improvo.geometry.camera_files import Calibration
+from improvo.geometry.trajectory_files import clean_poses
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
-from improvo.sequences.calibration import Calibration
 from improvo.sequences.images import decode, depth_in_metres
 from improvo.sequences.registration import intrinsics_of, register_depth, relative_extrinsics
-from improvo.sequences.trajectory_files import clean_poses
 from improvo.types import Float32, Int64, Trajectory, UInt8
 
 FPS = 30.0

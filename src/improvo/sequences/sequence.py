@@ -10,9 +10,9 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
+from improvo.geometry.camera_files import Calibration, from_field_of_view, load_calibration
 from improvo.sequences.association import poses_at
 from improvo.sequences.base import Recording, SequenceSettings, SkippedFrame, UnreadableFrameError
-from improvo.sequences.calibration import Calibration, from_field_of_view, load_calibration
 from improvo.sequences.images import grey
 from improvo.sequences.rectification import Rectifier
 from improvo.types import Float32, Float64, Frame, Int64, Trajectory, UInt8

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from improvo.errors import InputError
+from improvo.geometry.camera_files import Calibration, folder_calibration
+from improvo.geometry.trajectory_files import clean_poses
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.calibration import Calibration, folder_calibration
 from improvo.sequences.image_folder import frame_rate
 from improvo.sequences.images import IMAGE_SUFFIXES, read_depth, read_image
 from improvo.sequences.scannet_folder import read_matrix
-from improvo.sequences.trajectory_files import clean_poses
 from improvo.types import Float32, Trajectory, UInt8
 
 DEPTH_SCALE = 1000.0

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from improvo.errors import InputError
-from improvo.sequences.calibration import Calibration
-from improvo.sequences.trajectory_files import clean_poses
+from improvo.geometry.camera_files import Calibration
+from improvo.geometry.trajectory_files import clean_poses
 from improvo.types import Float64, Trajectory
 
 MAX_VARIATION = 0.01

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 from improvo.errors import InputError
+from improvo.geometry.camera_files import folder_calibration
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
-from improvo.sequences.calibration import folder_calibration
 from improvo.sequences.image_folder import DEFAULT_FPS
 from improvo.types import Int64, UInt8
 

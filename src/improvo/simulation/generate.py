@@ -15,13 +15,13 @@ import numpy as np
 from improvo.config import to_dict
 from improvo.files import make_output_folder, write_json, written_atomically
 from improvo.geometry.camera import Camera
-from improvo.sequences.tum_rgbd import TumRgbdWriter
 from improvo.simulation.causes import Cause, cause_image
 from improvo.simulation.flow import image_motion
 from improvo.simulation.renderer import SceneRenderer, camera_of
 from improvo.simulation.scene import build_scene
 from improvo.simulation.sensor import Sensor
 from improvo.simulation.settings import SimulationSettings
+from improvo.simulation.tum_writer import TumRgbdWriter
 from improvo.types import Float32, Float64, UInt8
 
 _INSTANT = 1e-3  # seconds over which image motion is taken

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from improvo.geometry.se3 import transform
-from improvo.labeling.grouping import medians, rows_of
 from improvo.labeling.labelled import LabelledSequence
-from improvo.labeling.stability import IGNORE, STABLE, UNSTABLE
+from improvo.stability.grouping import medians, rows_of
+from improvo.stability.rule import IGNORE, STABLE, UNSTABLE
 from improvo.training.settings import LandmarkSettings
 from improvo.training.wrong_links import largest_step_shares
 from improvo.types import Float32, Float64, Int64, UInt8
@@ -29,7 +29,7 @@ class FramePoints:
 
     points: Float64  # (N, 2)
     landmark: Int64  # (N,)
-    stability: Codes  # (N,) codes of `improvo.labeling.stability`
+    stability: Codes  # (N,) codes of `improvo.stability.rule`
     seen: NDArray[np.bool_]  # (N,) whether a track saw it in this frame, or only the projection says that it is there
 
 

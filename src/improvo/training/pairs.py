@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from improvo.training.distributed import Share
 from improvo.training.labels import PointLabels, label_cells
 from improvo.training.photometric import augment
 from improvo.training.pictures import Pictures
 from improvo.training.settings import HomographiesSettings
-from improvo.training.share import Share
 from improvo.training.views import cell_centres, inside, random_view, warp_image, warp_points
 from improvo.types import Float32, Float64, Int64, UInt8
 

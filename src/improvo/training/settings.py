@@ -87,8 +87,8 @@ class HomographiesSettings:
     """`improvo train homographies`: homographic adaptation, then detector and descriptor on pairs of views."""
 
     architecture: str = "superpoint"
-    # channels of the first four layers that are used, the others stay zero (`improvo.frontend.live_channels`); 0 for as
-    # many as the weights use that are started from
+    # channels of the first four layers that are used, the others stay zero (`improvo.frontend.channel_pruning`); 0 for
+    # as many as the weights use that are started from
     stem_channels: int = 0
     longer_side: int = 320  # pixels; larger pictures are reduced on loading
     shapes: int = 450  # drawn pictures with exact corners among the others; 0 leaves them out

@@ -15,7 +15,7 @@ import torch
 from improvo import __version__, config, files
 from improvo.errors import ConfigError, InputError
 from improvo.frontend.architecture import ARCHITECTURES, Architecture
-from improvo.frontend.live_channels import with_dead_channels, without_dead_channels
+from improvo.frontend.channel_pruning import with_dead_channels, without_dead_channels
 from improvo.frontend.superpoint import SuperPoint
 from improvo.frontend.weights import DataSource, ModelCard, Weights, load_weights, save_weights
 from improvo.training.adaptation import Detector, adapt, network_detector, shi_tomasi

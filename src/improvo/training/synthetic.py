@@ -5,12 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from improvo.training.distributed import Share
 from improvo.training.labels import PointLabels, label_cells
 from improvo.training.photometric import augment
 from improvo.training.pictures import Source
 from improvo.training.settings import ShapesSettings
 from improvo.training.shapes import FAMILIES, draw_shape
-from improvo.training.share import Share
 from improvo.training.views import random_view, warp_image, warp_points
 
 SIZE = (320, 240)  # width, height of the drawn pictures

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from improvo.labeling.stability import STABLE, UNSTABLE
+from improvo.stability.rule import STABLE, UNSTABLE
+from improvo.training.distributed import Share
 from improvo.training.labelled_frames import FramePoints, LabelledFrames, common_points
 from improvo.training.labels import DUSTBIN, IGNORED, label_cells
 from improvo.training.pairs import PairBatches, View
 from improvo.training.photometric import augment
 from improvo.training.settings import AdaptationSettings, OdometryTrainingSettings
-from improvo.training.share import Share
 from improvo.training.views import inside, random_view, warp_image, warp_points
 from improvo.types import Float32, Float64, Int64, UInt8
 

@@ -22,8 +22,8 @@ from tqdm import tqdm
 
 from improvo import files
 from improvo.errors import ImprovoError, InputError
+from improvo.training.distributed import Share
 from improvo.training.settings import OptimiserSettings
-from improvo.training.share import Share
 
 CHECKPOINT = "checkpoint.pt"
 METRICS = "metrics.jsonl"

@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from improvo.geometry.se3 import transform
-from improvo.labeling.grouping import rows_of
 from improvo.labeling.labelled import LabelledSequence
-from improvo.labeling.stability import UNSTABLE
+from improvo.stability.grouping import rows_of
+from improvo.stability.rule import UNSTABLE
 from improvo.types import Float64
 
 

@@ -1,0 +1,233 @@
+"""Labelling many sequences: odometry, labels and second opinion for each, resumable, one failure spoils no other."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from improvo.config import to_dict
+from improvo.errors import ImprovoError, InputError, OutputError
+from improvo.jobs.on_ray import run_on_ray
+from improvo.jobs.processes import Tick, run_here, run_in_processes
+from improvo.labeling.frames import FRAMES_FILE, FramesTable, pack_images, write_frames
+from improvo.labeling.quality import judge_frames, withhold_labels
+from improvo.labeling.store import DONE, FAILED, LabelStore, SequenceRecord, sequence_names
+from improvo.odometry.run_settings import RunSettings
+from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsWriter, read_points, read_tracks
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class LabelJob:
+    """One sequence to label."""
+
+    name: str
+    path: Path
+    folder: Path  # to write in; does not exist yet
+    settings: RunSettings
+    pack: bool
+
+
+def label_sequences(
+    paths: Sequence[Path],
+    folder: Path,
+    settings: RunSettings,
+    workers: int | None = None,
+    pack: bool = False,
+    relabel: bool = False,
+    ray: str | None = None,
+    on_record: Callable[[SequenceRecord], None] = lambda record: None,
+    on_frames: Callable[[int], None] = lambda count: None,
+) -> list[SequenceRecord]:
+    """Label every recording that the store does not have yet.
+
+    Args:
+        folder: of the label store, see `improvo.labeling.store`.
+        workers: sequences at a time, a process for each; one, or with `ray` as many as the cluster has cores, if None.
+        ray: address of a Ray cluster that does the work, see `improvo.jobs.on_ray`.
+        on_record: is told each sequence as it is done, has failed, or was done before.
+        on_frames: is told the number of further frames processed.
+
+    Returns:
+        The records of the given recordings, in their order.
+
+    Raises:
+        InputError: none of them could be labelled, or there is no Ray cluster.
+        MissingExtraError: Ray is not installed.
+        OutputError, ConfigError: the store cannot be used, see `LabelStore`.
+    """
+    names = sequence_names(list(paths))
+    store = LabelStore(folder, _fingerprint(settings, pack), relabel)
+    before = {record.name: record for record in store.records() if record.state == DONE}
+    records = {name: before[name] for name in names if name in before}
+    for name, record in records.items():
+        if record.path != str(names[name]):
+            raise InputError(f"{names[name]}: the store has another recording named {name}; rename one of them")
+        on_record(record)
+    jobs = [
+        LabelJob(name, path, store.partial(name), settings, pack) for name, path in names.items() if name not in before
+    ]
+
+    def on_result(job: LabelJob, result: SequenceRecord | Exception) -> None:
+        records[job.name] = _stored(store, job, result)
+        on_record(records[job.name])
+
+    if ray is not None and jobs:
+        run_on_ray(label_sequence, jobs, on_result, on_frames, ray, workers)
+    elif len(jobs) <= 1 or (workers or 1) <= 1:
+        run_here(label_sequence, jobs, on_result, on_frames)
+    else:
+        run_in_processes(label_sequence, jobs, on_result, on_frames, min(workers or 1, len(jobs)))
+    try:
+        store.write_manifest()
+    except OutputError as error:  # the labels do not need it, and the next run writes it
+        logger.warning("%s", error)
+    if not any(record.state == DONE for record in records.values()):
+        first = records[next(iter(names))]
+        raise InputError(f"nothing could be labelled; {first.name}: {first.reason}")
+    return [records[name] for name in names]
+
+
+def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
+    """Label one recording into `job.folder`.
+
+    Raises:
+        InputError: no frame got a pose, or no track is long enough to have a label.
+        KeyboardInterrupt: it was interrupted; the folder is worth nothing.
+    """
+    from improvo.odometry.run import run_odometry
+    from improvo.sequences import open_sequence
+
+    started = time.perf_counter()
+    sequence = open_sequence(job.path, job.settings.sequence)
+    summary = run_odometry(sequence, job.folder, job.settings, "label", progress=lambda view: tick())
+    report = summary.report
+    if report["interrupted"]:
+        raise KeyboardInterrupt
+    tracked = report["frames"]["tracked"]
+    if tracked == 0:
+        raise InputError(f"{job.path}: no frame got a pose: {_last_reason(report)}")
+
+    points, tracks = read_points(job.folder / POINTS_FILE), read_tracks(job.folder / TRACKS_FILE)
+    contradictions = [event["position"] for event in report["events"] if event["kind"] == "contradiction"]
+    has_pose = summary.trajectory.valid
+    trust = judge_frames(
+        tracks,
+        points,
+        has_pose,
+        np.array(contradictions, np.int64),
+        job.settings.labels,
+        summary.trajectory.segment,
+    )
+    trusted = trust.trusted
+    if job.settings.labels.second_opinion.enabled:
+        points = withhold_labels(points, tracks, trusted, job.settings.labels)
+        with PointsWriter(job.folder / POINTS_FILE) as writer:
+            writer.write(points)
+    counts = points.counts()
+    if counts["stable"] + counts["unstable"] == 0:
+        raise InputError(f"{job.path}: no track has a label ({_why_none(trust.counts(), counts)})")
+    count = len(has_pose)
+    frames = FramesTable(
+        frame=np.arange(count),
+        index=np.array(report["frames"]["source_index"], np.int64),
+        time=summary.trajectory.times,
+        segment=summary.trajectory.segment,
+        trusted=trusted,
+    )
+    write_frames(job.folder / FRAMES_FILE, frames)
+    if job.pack:
+        try:
+            pack_images(job.folder, (frame.image for frame in sequence))
+        except OSError as error:
+            raise OutputError(f"{job.folder}: the frames cannot be packed ({error}); choose another folder") from None
+    return SequenceRecord(
+        name=job.name,
+        path=str(job.path),
+        state=DONE,
+        notes=_notes(report, trust.counts()),
+        format=sequence.format,
+        frames=count,
+        tracked=tracked,
+        trusted=int((trusted & has_pose).sum()),
+        segments=len(report["segments"]),
+        tracks=len(points),
+        stable=counts["stable"],
+        unstable=counts["unstable"],
+        ignore=counts["ignore"],
+        withheld=counts["withheld"],
+        packed=job.pack,
+        seconds=round(time.perf_counter() - started, 3),
+    )
+
+
+def _stored(store: LabelStore, job: LabelJob, result: SequenceRecord | Exception) -> SequenceRecord:
+    """Put a result in its place; whatever goes wrong with it, such as a full disk, is a failure of this one."""
+    if isinstance(result, SequenceRecord):
+        try:
+            store.finish(result)
+            return result
+        except (ImprovoError, OSError) as error:
+            result = error
+    record = _failure(job, result)
+    try:
+        store.fail(record)
+    except OutputError as error:
+        logger.warning("%s", error)
+    return record
+
+
+def _failure(job: LabelJob, error: Exception) -> SequenceRecord:
+    """What the manifest says of a sequence that could not be labelled."""
+    if not isinstance(error, ImprovoError | OSError):
+        logger.error("labelling %s failed unexpectedly", job.path, exc_info=error)
+        error = InputError(f"{job.path}: unexpected {type(error).__name__}: {' '.join(str(error).split())}")
+    return replace(SequenceRecord(job.name, str(job.path), FAILED), reason=str(error))
+
+
+def _fingerprint(settings: RunSettings, pack: bool) -> dict[str, Any]:
+    """Everything that the labels depend on; a weights file by its content."""
+    import hashlib
+
+    values = {**to_dict(settings), "pack": pack}
+    weights = Path(settings.frontend.name)
+    if weights.suffix == ".safetensors" and weights.is_file():
+        values["frontend"]["name"] = f"sha256:{hashlib.sha256(weights.read_bytes()).hexdigest()}"
+    return values
+
+
+def _last_reason(report: dict[str, Any]) -> str:
+    events = report["events"]
+    return events[-1]["detail"] if events else "too little motion or texture"
+
+
+def _notes(report: dict[str, Any], trust: dict[str, int]) -> str:
+    """What of a labelled sequence has no labels, and why, in one line."""
+    notes = []
+    if skipped := report["input"]["skipped"]:
+        notes.append(f"{len(skipped)} unreadable (first: frame {skipped[0]['index']}, {skipped[0]['reason']})")
+    if lost := report["frames"]["lost_frames"]:
+        why = {event["position"]: event["detail"] for event in report["events"]}
+        notes.append(f"{len(lost)} without a pose (first: frame {lost[0]}, {why.get(lost[0], _last_reason(report))})")
+    if len(report["segments"]) > 1:
+        starts = ", ".join(str(segment["first"]) for segment in report["segments"][1:])
+        notes.append(f"tracking began anew at frame {starts}")
+    reasons = {"high_error": "that fit badly", "little_parallax": "of little parallax", "contradicted": "in doubt"}
+    notes += [f"{trust[name]} {words}" for name, words in reasons.items() if trust[name]]
+    return "; ".join(notes)
+
+
+def _why_none(trust: dict[str, int], counts: dict[str, int]) -> str:
+    if counts["withheld"]:
+        return (
+            f"{counts['withheld']} withheld: of its frames {trust['little_parallax']} have too little parallax, "
+            f"{trust['high_error']} too large errors, {trust['no_pose']} no pose"
+        )
+    return "none is long enough, or all are in between stable and unstable"

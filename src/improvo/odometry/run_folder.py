@@ -1,0 +1,229 @@
+"""The output folder of `improvo run` or `improvo label`, read back for pictures and exports."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from improvo import config
+from improvo.errors import InputError
+from improvo.geometry.camera import Camera
+from improvo.sequences import Sequence, SequenceSettings, open_sequence, read_trajectory
+from improvo.stability.rule import IGNORE
+from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
+from improvo.types import Float64, Int64, SparseMap, Trajectory, UInt8
+
+_PLY_TYPES = {"float": "<f4", "double": "<f8", "int": "<i4", "uint": "<u4", "uchar": "u1", "short": "<i2"}
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What one frame saw, one row per track."""
+
+    track: Int64  # (N,)
+    keypoints: Float64  # (N, 2) pixels
+    error: Float64  # (N,) pixels, NaN where there is none
+    age: Int64  # (N,) frames since the track began
+    stability: NDArray[np.int8]  # (N,) label of the track
+
+    def __len__(self) -> int:
+        return len(self.track)
+
+
+class RunFolder:
+    """Reads what is asked for, when it is asked for.
+
+    Args:
+        path: the folder.
+        sequence_path: where the recording is now; by default where run.json says it was.
+
+    Raises:
+        InputError: the folder has no readable run.json.
+    """
+
+    def __init__(self, path: Path, sequence_path: Path | None = None) -> None:
+        self.path = path
+        self._sequence_path = sequence_path
+        if not path.is_dir():
+            raise InputError(f"{path}: no such folder; give the output folder of `improvo run`")
+        try:
+            self.report: dict[str, Any] = json.loads((path / "run.json").read_text())
+            self._recorded_input = Path(self.report["input"]["path"])
+            self.source_index: list[int] = self.report["frames"]["source_index"]
+        except FileNotFoundError:
+            raise InputError(f"{path}: has no run.json; give the output folder of `improvo run`") from None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path / 'run.json'}: cannot be read ({error}); run `improvo run` again") from None
+
+    @property
+    def name(self) -> str:
+        """The recording's name."""
+        return self._recorded_input.name or str(self._recorded_input)
+
+    @property
+    def frames(self) -> int:
+        """Number of processed frames; a frame's position is 0 to this."""
+        return len(self.source_index)
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The pinhole camera of the processed frames."""
+        return Camera(**self.report["camera"])
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """Poses of the frames that have one, maybe none."""
+        if self.report["frames"]["tracked"] == 0:  # a file without poses is otherwise an error
+            return Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+        return read_trajectory(self.path / "trajectory.txt")
+
+    @cached_property
+    def positions(self) -> Int64:
+        """(N,) the position in the processed sequence of each row of `trajectory`."""
+        lost = set(self.report["frames"]["lost_frames"])
+        positions = np.array([p for p in range(self.frames) if p not in lost], np.int64)
+        if len(positions) != len(self.trajectory):
+            raise InputError(
+                f"{self.path}: trajectory.txt has {len(self.trajectory)} poses, run.json {len(positions)}; run again"
+            )
+        return positions
+
+    @cached_property
+    def map(self) -> SparseMap:
+        """The map points."""
+        return read_map(self.path / "map.ply")
+
+    @cached_property
+    def points(self) -> PointsTable:
+        """The labels, one row per track."""
+        return read_points(self.path / POINTS_FILE)
+
+    @cached_property
+    def tracks(self) -> TracksTable:
+        """The observations, sorted by track, then frame."""
+        return read_tracks(self.path / TRACKS_FILE)
+
+    @cached_property
+    def sequence(self) -> Sequence:
+        """The recording, opened as it was for the run."""
+        settings = config.from_dict(SequenceSettings, self.report["configuration"]["sequence"], "run.json")
+        path = self._sequence_path or self._recorded_input
+        if not path.exists():
+            raise InputError(f"{path}: the recording is not there any more; name it with --sequence PATH")
+        sequence = open_sequence(path, settings)
+        if (sequence.camera.width, sequence.camera.height) != (self.camera.width, self.camera.height):
+            raise InputError(f"{path}: its frames have another size than those of the run; name the right one")
+        return sequence
+
+    @cached_property
+    def _row_of_index(self) -> dict[int, int]:
+        return {int(index): row for row, index in enumerate(self.sequence.indices)}
+
+    def image(self, position: int) -> UInt8:
+        """The grey image (H, W) of a processed frame.
+
+        Raises:
+            InputError: there is no such frame in the run or in the recording.
+        """
+        if not 0 <= position < self.frames:
+            raise InputError(f"{self.path}: has no frame {position}; frames are 0 to {self.frames - 1}")
+        row = self._row_of_index.get(self.source_index[position])
+        if row is None:
+            raise InputError(f"{self.sequence.path}: has no frame {self.source_index[position]}; is it the recording?")
+        return self.sequence[row].image
+
+    @cached_property
+    def _first_rows(self) -> tuple[Int64, Int64]:
+        """Row of each track's first observation, and the track's index per observation."""
+        starts = np.flatnonzero(np.diff(self.tracks.track, prepend=-1))
+        lengths = np.diff(np.append(starts, len(self.tracks)))
+        return starts, np.repeat(np.arange(len(starts)), lengths)
+
+    @cached_property
+    def _rows_by_frame(self) -> tuple[Int64, Int64]:
+        order = np.argsort(self.tracks.frame, kind="stable")
+        return order, np.searchsorted(self.tracks.frame[order], np.arange(self.frames + 1))
+
+    def rows_at(self, position: int) -> Int64:
+        """Rows of `tracks` that belong to one frame."""
+        order, bounds = self._rows_by_frame
+        return order[bounds[position] : bounds[position + 1]]
+
+    @cached_property
+    def birth(self) -> Int64:
+        """(M,) the frame in which each observation's track began."""
+        starts, index = self._first_rows
+        return self.tracks.frame[starts][index]
+
+    @cached_property
+    def stability_of_rows(self) -> NDArray[np.int8]:
+        """(M,) the label of each observation's track."""
+        starts, index = self._first_rows
+        ids = self.tracks.track[starts]
+        order = np.argsort(self.points.track)
+        if len(order) == 0:
+            return np.full(len(self.tracks), IGNORE, np.int8)
+        found = np.minimum(np.searchsorted(self.points.track[order], ids), len(order) - 1)
+        labels = np.where(self.points.track[order[found]] == ids, self.points.stability[order[found]], IGNORE)
+        return labels[index].astype(np.int8)
+
+    def rows_of(self, position: int, tracks: Int64) -> Int64:
+        """Rows of `tracks` where one frame saw the given tracks, -1 where it did not."""
+        rows = self.rows_at(position)
+        ids = self.tracks.track[rows]  # increasing: the table is sorted by track
+        if len(ids) == 0:
+            return np.full(len(tracks), -1, np.int64)
+        found = np.minimum(np.searchsorted(ids, tracks), len(ids) - 1)
+        return np.where(ids[found] == tracks, rows[found], -1)
+
+    def observations(self, position: int) -> Observations:
+        """The tracks of one frame."""
+        rows = self.rows_at(position)
+        return Observations(
+            self.tracks.track[rows],
+            self.tracks.keypoints[rows].astype(np.float64),
+            self.tracks.error[rows].astype(np.float64),
+            position - self.birth[rows],
+            self.stability_of_rows[rows],
+        )
+
+
+def read_map(path: Path) -> SparseMap:
+    """Read the `map.ply` of a run.
+
+    Raises:
+        InputError: missing, damaged, or not written by improvo.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); `improvo run` writes it") from None
+    header, separator, body = content.partition(b"end_header\n")
+    lines = header.decode("ascii", "replace").split("\n")
+    count = next((int(line.split()[2]) for line in lines if line.startswith("element vertex")), -1)
+    properties = [line.split() for line in lines if line.startswith("property")]
+    if not separator or count < 0 or "format binary_little_endian 1.0" not in lines:
+        raise InputError(f"{path}: is no map that improvo wrote; run `improvo run` again")
+    try:
+        dtype = np.dtype([(name, _PLY_TYPES[kind]) for _, kind, name in properties])
+        vertices = np.frombuffer(body, dtype, count)
+        xyz = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        mean_error = vertices["mean_error"].astype(np.float64)
+        return SparseMap(
+            ids=np.arange(count),
+            xyz=xyz,
+            observations=vertices["observations"].astype(np.int64),
+            mean_error=mean_error,
+            max_error=np.full(count, np.nan),
+            segment=vertices["segment"].astype(np.int64),
+        )
+    except (ValueError, KeyError) as error:
+        raise InputError(
+            f"{path}: is damaged or no map that improvo wrote ({error}); run `improvo run` again"
+        ) from None

@@ -1,0 +1,142 @@
+"""Which tracks are stable: the paper's rule on the re-projection errors of every link a track had.
+
+A track's point is solved robustly with the final poses held, so that a link that slid, or jumped to something else,
+shows its whole error instead of pulling the point between the two (docs/labels.md has the comparison).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from improvo.geometry.settings import TriangulationSettings
+from improvo.stability.settings import LabelSettings
+from improvo.types import Float64, Int64, Tracks
+
+IGNORE, UNSTABLE, STABLE = 0, 1, 2
+STABILITY_NAMES = ("ignore", "unstable", "stable")  # by code
+
+
+@dataclass(frozen=True)
+class TrackLabels:
+    """One row per track, in the order of the tracks' first rows; `errors` has one row per observation."""
+
+    track: Int64  # (T,) track id
+    point: Int64  # (T,) map point that owns the track, -1 where none does
+    segment: Int64  # (T,) segment whose poses the errors are measured under, -1 where no pose saw the track
+    xyz: Float64  # (T, 3) in that segment's world; NaN with fewer than two observations
+    observations: Int64  # (T,) T_j: observations by cameras of that segment
+    mean_error: Float64  # (T,) pixels; NaN without a point
+    max_error: Float64  # (T,) pixels
+    stability: NDArray[np.int8]  # (T,) IGNORE, UNSTABLE or STABLE
+    parallax_deg: Float64  # (T,) largest angle between two rays from the point to cameras that saw it
+    distrusted: NDArray[np.bool_]  # (T,) a label was withheld by the second opinion (`improvo.labeling.quality`)
+    errors: Float64  # (M,) pixels, per observation; NaN where it has none
+
+    def __len__(self) -> int:
+        return len(self.track)
+
+    def counts(self) -> dict[str, int]:
+        """Number of tracks per label, and of labels withheld."""
+        by_code = np.bincount(self.stability, minlength=len(STABILITY_NAMES))
+        names = {name: int(by_code[code]) for code, name in enumerate(STABILITY_NAMES)}
+        return {**names, "withheld": int(self.distrusted.sum())}
+
+
+def classify(observations: Int64, mean_error: Float64, max_error: Float64, settings: LabelSettings) -> NDArray[np.int8]:
+    """The rule alone (paper, eq. stability): codes (T,)."""
+    long_enough = observations >= settings.min_observations
+    stable = long_enough & (mean_error <= settings.stable_mean_error)
+    unstable = long_enough & ~stable & (max_error >= settings.unstable_max_error)
+    return np.where(stable, STABLE, np.where(unstable, UNSTABLE, IGNORE)).astype(np.int8)
+
+
+def label_stability(
+    tracks: Tracks,
+    cam_from_world: Float64,
+    segment: Int64,
+    K: Float64,
+    settings: LabelSettings | None = None,
+    point: Int64 | None = None,
+    point_xyz: Float64 | None = None,
+) -> TrackLabels:
+    """Label whole tracks under final poses; any subset of tracks gives the same labels as all at once.
+
+    Args:
+        tracks: complete tracks, sorted by track, then frame, with every link they had.
+        cam_from_world: (F, 4, 4) final poses by `tracks.frame`; NaN where there is none.
+        segment: (F,) segment of each pose, -1 where there is none; a track is judged in the one that saw most of it.
+        K: (3, 3).
+        point: (T,) map point of each track in the order in which the tracks appear, -1 where none; for the record.
+        point_xyz: (T, 3) where the odometry already has the point, NaN where it is to be solved here.
+
+    Returns:
+        Labels. A point behind one of the cameras that saw it is never called stable.
+    """
+    from improvo.geometry.triangulation import triangulate_tracks
+
+    settings = settings or LabelSettings()
+    first = np.flatnonzero(np.diff(tracks.track, prepend=np.iinfo(np.int64).min)) if len(tracks) else np.zeros(0, int)
+    row_track = np.repeat(np.arange(len(first)), np.diff(first, append=len(tracks)))
+    count = len(first)
+
+    home = _home_segment(np.asarray(segment)[tracks.frame], row_track, count)
+    rows = np.flatnonzero((segment[tracks.frame] == home[row_track]) & (home[row_track] >= 0))
+    used = row_track[rows]
+    observations = np.bincount(used, minlength=count).astype(np.int64)
+    offsets = np.concatenate([[0], np.cumsum(observations)])
+    keypoints = tracks.keypoints[rows].astype(np.float64)
+    solved = triangulate_tracks(
+        keypoints,
+        tracks.frame[rows],
+        offsets,
+        cam_from_world,
+        K,
+        TriangulationSettings(loss=settings.loss, loss_width=settings.loss_width),
+        points=point_xyz,
+    )
+    errors = np.full(len(tracks), np.nan)
+    errors[rows] = solved.errors
+    mean_error, max_error = _mean_and_max(solved.errors, used, observations)
+
+    stability = classify(observations, mean_error, max_error, settings)
+    stability[(stability == STABLE) & ~solved.in_front] = IGNORE
+    return TrackLabels(
+        track=tracks.track[first],
+        point=np.full(count, -1, np.int64) if point is None else np.asarray(point, np.int64),
+        segment=home,
+        xyz=solved.points,
+        observations=observations,
+        mean_error=mean_error,
+        max_error=max_error,
+        stability=stability,
+        parallax_deg=solved.parallax_deg,
+        distrusted=np.zeros(count, np.bool_),
+        errors=errors,
+    )
+
+
+def _home_segment(row_segment: Int64, row_track: Int64, count: int) -> Int64:
+    """The segment that saw most of each track, the earlier one of equals; -1 where no pose did."""
+    home = np.full(count, -1, np.int64)
+    if not len(row_segment):
+        return home
+    most = np.zeros(count, np.int64)
+    for number in np.unique(row_segment[row_segment >= 0]):
+        seen = np.bincount(row_track[row_segment == number], minlength=count)
+        home[seen > most] = number
+        most = np.maximum(most, seen)
+    return home
+
+
+def _mean_and_max(errors: Float64, track: Int64, observations: Int64) -> tuple[Float64, Float64]:
+    """Per track, NaN for a track without errors."""
+    known = np.isfinite(errors)
+    total = np.bincount(track[known], weights=errors[known], minlength=len(observations))
+    number = np.bincount(track[known], minlength=len(observations))
+    largest = np.full(len(observations), -np.inf)
+    np.maximum.at(largest, track[known], errors[known])
+    empty = number == 0
+    return np.where(empty, np.nan, total / np.maximum(number, 1)), np.where(empty, np.nan, largest)
