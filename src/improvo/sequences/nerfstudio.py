@@ -14,14 +14,19 @@ import cv2
 import numpy as np
 
 from improvo.errors import InputError
-from improvo.geometry.camera_files import Calibration
+from improvo.geometry.camera_files import Calibration, camera_of
 from improvo.sequences.base import Recording, SequenceSettings
 from improvo.sequences.image_folder import frame_rate
 from improvo.sequences.images import natural_key, read_depth, read_image
 from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
 from improvo.types import Float32, Float64, UInt8
 
-_BROWN = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
+_NO_LENS = {
+    *("frames", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov"),
+    *("aabb_scale", "scale", "offset", "aabb", "render_aabb", "sharpness", "colmap_im_id", "applied_scale"),
+    *("applied_transform", "orientation_override", "train_filenames", "val_filenames", "test_filenames", "up"),
+    *("depth_unit_scale_factor", "timestamp", "time", "integer_depth_scale", "enable_depth_loading", "rotation"),
+}
 
 
 class Nerfstudio(Recording):
@@ -85,7 +90,11 @@ def _file(folder: Path, name: str) -> Path:
 def _calibration(
     source: str, content: dict[str, Any], frames: list[dict[str, Any]]
 ) -> tuple[Calibration, list[str]] | None:
-    """Intrinsics of all frames, those of the whole file where a frame has none; None where neither has any."""
+    """Intrinsics of all frames, those of the whole file where a frame has none; None where neither has any.
+
+    Raises:
+        InputError: a lens that is not supported, or one that changes between frames.
+    """
     size_numbers = numbers([_value(frames[0], content, "w"), _value(frames[0], content, "h")], 2)
     size = None
     if np.isfinite(size_numbers).all() and (size_numbers >= 1).all():
@@ -93,14 +102,18 @@ def _calibration(
     rows = np.stack([_intrinsics(frame, content, size) for frame in frames])
     if not np.isfinite(rows).all(axis=1).any():
         return None
-    model = str(content.get("camera_model", "OPENCV")).upper()
-    names = ("k1", "k2", "k3", "k4") if model == "OPENCV_FISHEYE" else ("k1", "k2", "p1", "p2", "k3")
-    if model != "OPENCV_FISHEYE" and model not in _BROWN:
-        raise InputError(f"{source}: camera_model {model} is not supported; undistort the images, or give --camera")
-    values = tuple(float(_value(frames[0], content, name) or 0.0) for name in names)
-    fisheye = model == "OPENCV_FISHEYE"
-    distortion = values if fisheye or any(values) else ()
-    return median_calibration(source, rows, distortion, "fisheye" if fisheye else "brown", size)
+    lenses = [{key: value for key, value in frame.items() if _is_lens(key)} for frame in frames]
+    if any(lens != lenses[0] for lens in lenses):
+        raise InputError(f"{source}: the distortion changes between frames; undistort the images, or give --camera")
+    usable = rows[np.isfinite(rows).all(axis=1)][0] + [0.0, 0.0, 0.5, 0.5]
+    given = {key: value for key, value in content.items() if _is_lens(key) or key in ("w", "h")} | lenses[0]
+    lens = camera_of({**given, **dict(zip(("fl_x", "fl_y", "cx", "cy"), usable.tolist(), strict=True))}, source)
+    return median_calibration(source, rows, lens.distortion, lens.distortion_model, size)
+
+
+def _is_lens(key: str) -> bool:
+    """Whether a key of the file or of a frame is about the lens; names, poses and sizes are not."""
+    return key not in _NO_LENS and not key.endswith(("_path", "_matrix"))
 
 
 def _intrinsics(frame: dict[str, Any], content: dict[str, Any], size: tuple[int, int] | None) -> Float64:

@@ -8,8 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from improvo.errors import InputError
-from improvo.geometry.camera_files import MODEL_NAMES, Calibration, usual_length
+from improvo.geometry.camera_files import Calibration, camera_of
+from improvo.geometry.camera_files.distortion import MODEL_NAMES, normalised
 from improvo.geometry.se3 import rigid, rotation_from_quat_xyzw
 from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.images import decode, depth_in_metres
@@ -107,23 +107,24 @@ def calibration(message: Any, source: str, rectified: bool) -> Calibration | Non
         message: sensor_msgs/CameraInfo.
         source: for messages.
         rectified: the images are those of `image_rect`, whose camera is P, without distortion.
+
+    Raises:
+        InputError: a distortion that is not supported, or numbers that cannot be.
     """
     matrix = np.asarray(_field(message, "K"), np.float64).reshape(3, 3)
-    distortion = tuple(float(value) for value in _field(message, "D"))
-    model = MODEL_NAMES.get(str(message.distortion_model).lower())
-    if model is None:
-        raise InputError(f"{source}: distortion model {message.distortion_model} is not supported; give --camera")
+    distortion = [float(value) for value in _field(message, "D")]
+    content: dict[str, Any] = {"distortion_model": str(message.distortion_model), "D": distortion}
     if rectified:
-        matrix, distortion = np.asarray(_field(message, "P"), np.float64).reshape(3, 4)[:, :3], ()
+        matrix, content = np.asarray(_field(message, "P"), np.float64).reshape(3, 4)[:, :3], {}
     if not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
         return None
-    size = (int(message.width), int(message.height)) if message.width and message.height else None
-    intrinsics = (float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]))
-    if not any(distortion) and model != "fisheye":
-        distortion, model = (), "brown"
-    result = Calibration(source, intrinsics, usual_length(distortion, model), model, size)
-    result.camera(*(size or (1, 1)))
-    return result
+    if "D" in content and not any(distortion) and MODEL_NAMES.get(normalised(content["distortion_model"])) != "fisheye":
+        content = {}
+    roi = getattr(message, "roi", None)
+    names = ("x_offset", "y_offset", "height", "width") if roi is not None else ()
+    content |= {f"roi_{name}": int(getattr(roi, name)) for name in names}
+    content |= {name: int(getattr(message, name, 0)) for name in ("binning_x", "binning_y", "width", "height")}
+    return camera_of({"K": matrix.tolist(), **content}, source)
 
 
 def pose(message: Any) -> Float64:
