@@ -15,6 +15,7 @@ from improvo.geometry.camera_files import Calibration, folder_calibration
 from improvo.geometry.trajectory_files import read_trajectory_report
 from improvo.sequences.base import Recording, SequenceSettings
 from improvo.sequences.images import list_images, read_depth, read_image
+from improvo.sequences.rates import depth_scale
 from improvo.types import Float32, Trajectory, UInt8
 
 DEPTH_SCALE = 5000.0
@@ -37,15 +38,14 @@ class IclNuim(Recording):
         self._depth = [frames[number][1] for number in self._numbers]
         rate = settings.fps or FPS
         self.times = np.array(self._numbers, np.float64) / rate
-        self.calibration = folder_calibration(path) or Calibration(
-            "ICL-NUIM", (481.2, 480.0, 319.5, 239.5), size=(640, 480)
-        )
-        self._scale = self.calibration.depth_scale or DEPTH_SCALE
+        published = Calibration("ICL-NUIM", (481.2, 480.0, 319.5, 239.5), size=(640, 480))
+        self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: published)
+        self._scale = depth_scale(self.calibration, settings) or DEPTH_SCALE
         truth = next(iter(sorted(path.glob("*.gt.freiburg"))), None)
         if truth is not None:
-            published, self.notes = read_trajectory_report(truth, "tum")
-            poses = _UP_TO_DOWN @ published.world_from_cam @ _UP_TO_DOWN
-            self.ground_truth = Trajectory(published.times / rate, poses)
+            poses_up, self.notes = read_trajectory_report(truth, "tum")
+            poses = _UP_TO_DOWN @ poses_up.world_from_cam @ _UP_TO_DOWN
+            self.ground_truth = Trajectory(poses_up.times / rate, poses)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from improvo.errors import InputError
-from improvo.geometry.camera_files import Calibration, folder_calibration, load_calibration
+from improvo.geometry.camera_files import folder_calibration
 from improvo.geometry.trajectory_files import increasing_order, read_times, read_trajectory_report
 from improvo.sequences.base import Recording, SequenceSettings
 from improvo.sequences.images import list_images, read_image
+from improvo.sequences.rates import frame_rate
 from improvo.types import Float64, UInt8
 
-DEFAULT_FPS = 30.0
 _SUBFOLDERS = ("images", "image", "rgb", "color", "frames", "imgs")
 
 
@@ -34,7 +34,7 @@ class ImageFolder(Recording):
             raise InputError(f"{path}: has no images (png, jpg, tif, ...), nor an images folder with some")
         self._files = list_images(folder)
         extras = path if folder != path or not _is_images_of(path) else path.parent
-        self.calibration = folder_calibration(path) or folder_calibration(extras)
+        self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: folder_calibration(extras))
         notes: list[str] = []
         times_file = next((f / "times.txt" for f in (path, extras) if (f / "times.txt").is_file()), None)
         if times_file is not None and settings.fps is None:
@@ -68,17 +68,6 @@ class ImageFolder(Recording):
 
     def image(self, index: int) -> UInt8:
         return read_image(self._files[index])
-
-
-def frame_rate(calibration: Calibration | None, settings: SequenceSettings) -> tuple[float, str | None]:
-    """Frames per second of a recording without time stamps, and a note where it is only assumed."""
-    if settings.fps is not None:
-        return settings.fps, None
-    if settings.camera is not None:
-        calibration = load_calibration(settings.camera)
-    if calibration is not None and calibration.fps is not None:
-        return calibration.fps, None
-    return DEFAULT_FPS, f"has no time stamps; {DEFAULT_FPS:g} frames per second assumed, --fps changes it"
 
 
 def _image_folder(path: Path) -> Path | None:

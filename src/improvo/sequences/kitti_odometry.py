@@ -49,10 +49,17 @@ class KittiOdometry(Recording):
             times = order / (settings.fps or FPS)
         self._images, self.times = [self._images[row] for row in order], times[order]
         cam_from_cam0 = np.eye(4)
-        self.calibration = folder_calibration(path)
+        published: list[Calibration] = []
         if (path / "calib.txt").is_file():
-            calibration, cam_from_cam0 = _read_calibration(path / "calib.txt", number)
-            self.calibration = self.calibration or calibration
+            try:
+                calibration, cam_from_cam0 = _read_calibration(path / "calib.txt", number)
+                published.append(calibration)
+            except InputError as error:
+                self.calibration_error = error
+                notes += [f"{path}: poses are taken as those of these images' camera"] if number else []
+        self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: next(iter(published), None))
+        if self.calibration is not None:
+            self.calibration_error = None
         poses_file = next((file for file in _pose_files(path) if file.is_file()), None)
         if poses_file is not None:
             self.ground_truth, problems = _read_poses(poses_file, times, cam_from_cam0)
@@ -84,7 +91,8 @@ def _read_calibration(path: Path, number: int) -> tuple[Calibration, Float64]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
         rows = {line.split(":")[0].strip(): line.split(":", 1)[1].split() for line in lines if ":" in line}
-        projection = np.array(rows[f"P{number}"], np.float64).reshape(3, 4)
+        row = rows.get(f"P{number}", rows.get(f"P_rect_0{number}"))
+        projection = np.array(row or [], np.float64).reshape(3, 4)
         cam_from_cam0 = rigid(np.eye(3), np.linalg.solve(projection[:, :3], projection[:, 3]).astype(np.float64))
     except (OSError, UnicodeDecodeError, KeyError, ValueError, np.linalg.LinAlgError):
         raise InputError(f"{path}: has no row `P{number}:` with 12 numbers; repair it or give --camera") from None

@@ -16,8 +16,8 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, camera_of
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_folder import frame_rate
 from improvo.sequences.images import natural_key, read_depth, read_image
+from improvo.sequences.rates import frame_rate
 from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
 from improvo.types import Float32, Float64, UInt8
 
@@ -49,10 +49,8 @@ class Nerfstudio(Recording):
         unit = numbers(content.get("depth_unit_scale_factor", 0.001), 1)[0]
         self._scale = 1 / unit if unit > 0 else 1000.0
         notes: list[str] = []
-        self.calibration = None
-        calibrated = _calibration(str(file), content, frames)
-        if calibrated is not None:
-            self.calibration, notes = calibrated
+        self.calibration = self.own_calibration(lambda: _calibration(str(file), content, frames, notes))
+        self._size = _size(content, frames)
         rate, note = frame_rate(None, settings)
         notes += [f"{path}: {note}"] if note else []
         self.times = np.arange(len(frames)) / rate
@@ -75,8 +73,7 @@ class Nerfstudio(Recording):
         if not name:
             return None
         depth = read_depth(self._folder / str(name), self._scale)
-        assert self.calibration is not None
-        size = self.calibration.size
+        size = self._size
         if size is not None and depth.shape != (size[1], size[0]):
             return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
         return depth
@@ -88,17 +85,16 @@ def _file(folder: Path, name: str) -> Path:
 
 
 def _calibration(
-    source: str, content: dict[str, Any], frames: list[dict[str, Any]]
-) -> tuple[Calibration, list[str]] | None:
+    source: str, content: dict[str, Any], frames: list[dict[str, Any]], notes: list[str]
+) -> Calibration | None:
     """Intrinsics of all frames, those of the whole file where a frame has none; None where neither has any.
+
+    A line is added to `notes` where they vary.
 
     Raises:
         InputError: a lens that is not supported, or one that changes between frames.
     """
-    size_numbers = numbers([_value(frames[0], content, "w"), _value(frames[0], content, "h")], 2)
-    size = None
-    if np.isfinite(size_numbers).all() and (size_numbers >= 1).all():
-        size = (int(size_numbers[0]), int(size_numbers[1]))
+    size = _size(content, frames)
     rows = np.stack([_intrinsics(frame, content, size) for frame in frames])
     if not np.isfinite(rows).all(axis=1).any():
         return None
@@ -108,7 +104,13 @@ def _calibration(
     usable = rows[np.isfinite(rows).all(axis=1)][0] + [0.0, 0.0, 0.5, 0.5]
     given = {key: value for key, value in content.items() if _is_lens(key) or key in ("w", "h")} | lenses[0]
     lens = camera_of({**given, **dict(zip(("fl_x", "fl_y", "cx", "cy"), usable.tolist(), strict=True))}, source)
-    return median_calibration(source, rows, lens.distortion, lens.distortion_model, size)
+    return median_calibration(source, rows, lens.distortion, lens.distortion_model, size, notes)
+
+
+def _size(content: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[int, int] | None:
+    """Width and height of the images, None where the file does not say."""
+    values = numbers([_value(frames[0], content, "w"), _value(frames[0], content, "h")], 2)
+    return (int(values[0]), int(values[1])) if np.isfinite(values).all() and (values >= 1).all() else None
 
 
 def _is_lens(key: str) -> bool:

@@ -55,7 +55,10 @@ class Polycam(Recording):
         size_numbers = numbers([cameras[0].get("width"), cameras[0].get("height")], 2)
         size = (int(size_numbers[0]), int(size_numbers[1])) if (size_numbers >= 1).all() else None
         intrinsics = np.stack([numbers([c.get(key) for key in ("fx", "fy", "cx", "cy")], 4) for c in cameras])
-        self.calibration, more = median_calibration(str(folder / f"{prefix}cameras"), intrinsics, size=size)
+        more: list[str] = []
+        name = str(folder / f"{prefix}cameras")
+        self.calibration = self.own_calibration(lambda: median_calibration(name, intrinsics, size=size, notes=more))
+        self._size = size
         last_row = np.tile([[0.0, 0.0, 0.0, 1.0]], (len(names), 1))
         rows = np.stack([numbers([camera.get(key) for key in _POSE], 12) for camera in cameras])
         poses = np.concatenate([rows, last_row], axis=1).reshape(-1, 4, 4)
@@ -80,7 +83,7 @@ class Polycam(Recording):
         if not file.is_file():
             return None
         depth = read_depth(file, DEPTH_SCALE)
-        size = self.calibration.size if self.calibration is not None else None
+        size = self._size
         if size is not None and depth.shape != (size[1], size[0]):
             return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
         return depth

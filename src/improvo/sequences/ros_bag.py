@@ -50,7 +50,7 @@ class RosBag(Recording):
         order, repeated = increasing_order(stamps)
         notes += [f"{path}: {repeated} images repeat a time stamp and were left out"] if repeated else []
         self._rows, self.times = order, stamps[order]
-        self.calibration = _camera_info(self._reader, self._images.topic, path)
+        self.calibration = self.own_calibration(lambda: _camera_info(self._reader, self._images.topic, path))
         self._depths = depths
         self._notes = notes
 

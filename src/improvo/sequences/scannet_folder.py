@@ -13,10 +13,11 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
 from improvo.geometry.camera_files import Calibration, folder_calibration
+from improvo.geometry.camera_files.calibration import checked
 from improvo.geometry.trajectory_files import clean_poses
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_folder import frame_rate
 from improvo.sequences.images import list_images, read_depth, read_image
+from improvo.sequences.rates import frame_rate
 from improvo.sequences.registration import intrinsics_of, register_depth, relative_extrinsics
 from improvo.types import Float32, Float64, Trajectory, UInt8
 
@@ -50,7 +51,10 @@ class ScanNetFolder(Recording):
             self._depth = [path / "depth" / f"{stem}.png" for stem in stems]
             poses_files = [path / "pose" / f"{stem}.txt" for stem in stems]
             numbers = np.array([int(stem) if stem.isdigit() else row for row, stem in enumerate(stems)], np.float64)
-        self.calibration = folder_calibration(path) or self.calibration
+        published = self.calibration
+        self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: published)
+        if self.calibration is not None:
+            self.calibration_error = None
         given = settings.fps or settings.camera or (self.calibration and self.calibration.fps)
         self.times = (numbers - numbers[0]) / (frame_rate(self.calibration, settings)[0] if given else FPS)
         if len(self.times) > 1 and not (np.diff(self.times) > 0).all():
@@ -93,9 +97,8 @@ class ScanNetFolder(Recording):
         colour = read_matrix(folder / "intrinsic_color.txt")
         if np.isfinite(colour).all():
             height, width = read_image(self._images[0]).shape[:2]
-            self.calibration = Calibration(
-                str(folder / "intrinsic_color.txt"), intrinsics_of(colour), size=(width, height)
-            )
+            published = Calibration(str(folder / "intrinsic_color.txt"), intrinsics_of(colour), size=(width, height))
+            self.calibration = self.own_calibration(lambda: checked(published))
         depth = read_matrix(folder / "intrinsic_depth.txt")
         if np.isfinite(depth).all() and min(depth[0, 0], depth[1, 1]) > 0:
             self._depth_intrinsics = intrinsics_of(depth)
@@ -107,12 +110,15 @@ class ScanNetFolder(Recording):
         lines = info.read_text(encoding="utf-8", errors="replace").splitlines()
         values = {name.strip(): text.split() for name, _, text in (line.partition("=") for line in lines)}
         colour = _matrix(values.get("m_calibrationColorIntrinsic"))
-        if not np.isfinite(colour).all():
-            raise InputError(f"{info}: has no m_calibrationColorIntrinsic with 16 numbers; export the scene again")
         width, height = (_number(values.get(f"m_color{side}"), 0) for side in ("Width", "Height"))
         size = (int(width), int(height)) if width >= 1 and height >= 1 else None
-        self.calibration = Calibration(str(info), intrinsics_of(colour), size=size)
-        self.calibration.camera(*(size or (1, 1)))
+
+        def published() -> Calibration:
+            if not np.isfinite(colour).all():
+                raise InputError(f"{info}: has no m_calibrationColorIntrinsic with 16 numbers; export the scene again")
+            return checked(Calibration(str(info), intrinsics_of(colour), size=size))
+
+        self.calibration = self.own_calibration(published)
         depth = _matrix(values.get("m_calibrationDepthIntrinsic"))
         if np.isfinite(depth).all() and min(depth[0, 0], depth[1, 1]) > 0:
             self._depth_intrinsics = intrinsics_of(depth)

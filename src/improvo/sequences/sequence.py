@@ -68,7 +68,10 @@ class Sequence:
     @property
     def notes(self) -> tuple[str, ...]:
         """What was odd in the recording but could be handled, one line each."""
-        return self.recording.notes
+        error = self.recording.calibration_error
+        given = "--camera" if self.settings.camera is not None else "--fov"
+        left_out = () if error is None else (f"its own calibration is left out for {given} ({_first_part(error)})",)
+        return (*self.recording.notes, *left_out)
 
     @property
     def skipped(self) -> list[SkippedFrame]:
@@ -195,12 +198,19 @@ def _calibration(recording: Recording, settings: SequenceSettings, width: int, h
         return load_calibration(settings.camera)
     if settings.fov is not None:
         return from_field_of_view(settings.fov, width, height)
+    if recording.calibration_error is not None:
+        raise recording.calibration_error
     if recording.calibration is None:
         raise InputError(
             f"{recording.path}: has no calibration; give --camera FILE.yaml or fx,fy,cx,cy[,k1,k2,p1,p2,k3], "
             f"or roughly --fov DEGREES (horizontal; 60 to 75 for most phones and webcams)"
         )
     return recording.calibration
+
+
+def _first_part(error: InputError) -> str:
+    """What is wrong, without the advice."""
+    return str(error).split(";")[0]
 
 
 def _name(path: Path) -> str:

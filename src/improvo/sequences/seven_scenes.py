@@ -16,8 +16,8 @@ from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, folder_calibration
 from improvo.geometry.trajectory_files import clean_poses
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_folder import frame_rate
 from improvo.sequences.images import IMAGE_SUFFIXES, read_depth, read_image
+from improvo.sequences.rates import depth_scale, frame_rate
 from improvo.sequences.scannet_folder import read_matrix
 from improvo.types import Float32, Trajectory, UInt8
 
@@ -38,19 +38,17 @@ class SevenScenes(Recording):
             raise InputError(f"{path}: has no frame-NNNNNN.color.png files, so it is no 7-Scenes sequence")
         self._numbers = sorted(found)
         self._images = [found[number] for number in self._numbers]
-        self.calibration = folder_calibration(path)
+        self.calibration = self.own_calibration(lambda: folder_calibration(path))
         notes: list[str] = []
         has_depth = any(self._beside(row, "depth.png").is_file() for row in range(min(len(self._images), 10)))
-        if self.calibration is None:
+        if self.calibration is None and self.calibration_error is None:
             self.calibration = Calibration("7-Scenes default", (525.0, 525.0, 319.5, 239.5), size=(640, 480))
             notes.append(f"{path}: has no camera.yaml; a Kinect's usual focal length of 525 px assumed")
             if has_depth:
                 notes.append(f"{path}: original 7-Scenes depth is not registered to colour: do not trust it at edges")
-        self._scale = self.calibration.depth_scale or DEPTH_SCALE
-        if settings.fps is None and settings.camera is None and self.calibration.fps is None:
-            rate = FPS
-        else:
-            rate, _ = frame_rate(self.calibration, settings)
+        self._scale = depth_scale(self.calibration, settings) or DEPTH_SCALE
+        rate, assumed = frame_rate(self.calibration, settings)
+        rate = FPS if assumed else rate
         self.times = (np.array(self._numbers, np.float64) - self._numbers[0]) / rate
         self.ground_truth, problems = self._read_poses()
         self.notes = (*notes, *problems)

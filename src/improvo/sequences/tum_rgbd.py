@@ -17,6 +17,7 @@ from improvo.geometry.trajectory_files import increasing_order, read_trajectory_
 from improvo.sequences.association import nearest
 from improvo.sequences.base import Recording, SequenceSettings
 from improvo.sequences.images import read_depth, read_image
+from improvo.sequences.rates import depth_scale
 from improvo.types import Float32, Float64, UInt8
 
 DEPTH_SCALE = 5000.0
@@ -36,8 +37,8 @@ class TumRgbd(Recording):
         self.path = path
         pairs = None if (path / "rgb.txt").is_file() else _pairs_file(path)
         self.times, self._images, notes = _read_list(pairs or path / "rgb.txt", "rgb")
-        self.calibration = folder_calibration(path) or _published(path)
-        self._scale = (self.calibration and self.calibration.depth_scale) or DEPTH_SCALE
+        self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: _published(path))
+        self._scale = depth_scale(self.calibration, settings) or DEPTH_SCALE
         self._depth: list[Path] = []
         self._depth_row = np.full(len(self.times), -1, np.int64)
         if pairs is not None or (path / "depth.txt").is_file():

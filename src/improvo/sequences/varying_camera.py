@@ -27,8 +27,9 @@ def median_calibration(
     distortion: tuple[float, ...] = (),
     distortion_model: str = "brown",
     size: tuple[int, int] | None = None,
-) -> tuple[Calibration, list[str]]:
-    """One calibration from fx, fy, cx, cy (N, 4) of all frames, and a note where they differ by more than 1 %.
+    notes: list[str] | None = None,
+) -> Calibration:
+    """One calibration from fx, fy, cx, cy (N, 4) of all frames; a line is added to `notes` where they differ by 1 %.
 
     Raises:
         InputError: no frame has usable intrinsics.
@@ -41,13 +42,12 @@ def median_calibration(
     calibration = Calibration(source, (fx, fy, cx, cy), distortion, distortion_model, size)
     calibration.camera(*(size or (1, 1)))
     variation = float(np.abs(values / [fx, fy, fx, fy] - np.array([fx, fy, cx, cy]) / [fx, fy, fx, fy]).max())
-    notes = []
-    if variation > MAX_VARIATION:
+    if variation > MAX_VARIATION and notes is not None:
         notes.append(
             f"{source}: the intrinsics vary by {100 * variation:.1f} % of the focal length between frames; the median "
             "is used, so expect less accuracy (lock the focus when recording)"
         )
-    return calibration, notes
+    return calibration
 
 
 def trajectory_from_opengl(

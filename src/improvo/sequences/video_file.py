@@ -17,7 +17,7 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.geometry.camera_files import folder_calibration
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
-from improvo.sequences.image_folder import DEFAULT_FPS
+from improvo.sequences.rates import DEFAULT_FPS
 from improvo.types import Int64, UInt8
 
 VIDEO_SUFFIXES = frozenset(
@@ -68,7 +68,10 @@ class VideoFile(Recording):
             )
         count = len(self._stamps)
         self.times = self._stamps / 1e6 if settings.fps is None else np.arange(count) / settings.fps
-        self.calibration = folder_calibration(path.parent, (f"{path.stem}.yaml", "camera.yaml"))
+        beside = tuple(f"{path.stem}{suffix}" for suffix in (".yaml", ".yml", ".json"))
+        self.calibration = self.own_calibration(
+            lambda: folder_calibration(path.parent, beside), lambda: folder_calibration(path.parent)
+        )
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
