@@ -16,7 +16,8 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, camera_of
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.images import natural_key, read_depth, read_image
+from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.images import listed_file, natural_key, read_depth
 from improvo.sequences.rates import frame_rate
 from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
 from improvo.types import Float32, Float64, UInt8
@@ -43,12 +44,12 @@ class Nerfstudio(Recording):
         if not frames:
             raise InputError(f"{file}: lists no frames with a file_path; export it again")
         frames.sort(key=lambda frame: natural_key(str(frame["file_path"])))
-        self._images = [_file(file.parent, str(frame["file_path"])) for frame in frames]
+        self._images = ImageFiles((_file(file.parent, str(frame["file_path"])) for frame in frames), path)
         self._depth = [frame.get("depth_file_path") for frame in frames]
         self._folder = file.parent
         unit = numbers(content.get("depth_unit_scale_factor", 0.001), 1)[0]
         self._scale = 1 / unit if unit > 0 else 1000.0
-        notes: list[str] = []
+        notes = list(self._images.notes)
         self.calibration = self.own_calibration(lambda: _calibration(str(file), content, frames, notes))
         self._size = _size(content, frames)
         rate, note = frame_rate(None, settings)
@@ -63,16 +64,16 @@ class Nerfstudio(Recording):
         return path.name == "transforms.json" or (path / "transforms.json").is_file()
 
     def source(self, index: int) -> str:
-        return str(self._images[index])
+        return str(self._images.files[index])
 
     def image(self, index: int) -> UInt8:
-        return read_image(self._images[index])
+        return self._images.read(index)
 
     def depth(self, index: int) -> Float32 | None:
         name = self._depth[index]
         if not name:
             return None
-        depth = read_depth(self._folder / str(name), self._scale)
+        depth = read_depth(listed_file(self._folder, str(name)), self._scale)
         size = self._size
         if size is not None and depth.shape != (size[1], size[0]):
             return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
@@ -81,7 +82,7 @@ class Nerfstudio(Recording):
 
 def _file(folder: Path, name: str) -> Path:
     """The image; names without an ending mean PNG, as in NeRF's synthetic scenes."""
-    return folder / name if Path(name).suffix else folder / f"{name}.png"
+    return listed_file(folder, name if Path(name.replace("\\", "/")).suffix else f"{name}.png")
 
 
 def _calibration(

@@ -124,14 +124,19 @@ def _choose(pictures: list[Stream], topic: str | None, path: Path) -> Stream:
             if stream.topic == topic or stream.topic.lstrip("/") == topic.lstrip("/"):
                 return stream
     if not pictures or topic is not None:
-        known = ", ".join(stream.topic for stream in pictures) or "none"
+        known = ", ".join(stream.topic for stream in pictures) or "none (depth alone cannot be tracked)"
         wanted = f"no image topic {topic}" if topic else "no image topic"
         raise InputError(f"{path}: has {wanted}; topics with pictures: {known}")
 
     def rank(stream: Stream) -> tuple[bool, bool, bool, str]:
-        name = stream.topic
+        name = stream.topic.lower()
         # colour before infrared, left before right, the raw stream before its compressed or rectified copies
-        return ("infra" in name or "/ir/" in name, "right" in name, "compressed" in name or "rect" in name, name)
+        return (
+            "infra" in name or "/ir/" in name,
+            "right" in name,
+            "compressed" in name or "rect" in name,
+            stream.topic,
+        )
 
     return min(pictures, key=rank)
 
@@ -140,7 +145,8 @@ def _camera_info(reader: Any, topic: str, path: Path) -> Calibration | None:
     """The CameraInfo beside an image topic, else the only one of the bag."""
     infos = [c for c in reader.connections if c.msgtype == "sensor_msgs/msg/CameraInfo" and c.msgcount]
     parents = [topic.rsplit("/", depth)[0] for depth in (1, 2, 3) if topic.count("/") >= depth]
-    beside = next((c for parent in parents for c in infos if c.topic == f"{parent}/camera_info"), None)
+    names = [f"{parent}{name}" for parent in parents for name in ("/camera_info", "/info/camera_info")]
+    beside = next((c for name in names for c in infos if c.topic == name), None)
     chosen = beside or (infos[0] if len(infos) == 1 else None)
     if chosen is None:
         return None

@@ -94,9 +94,9 @@ def depth(message: Any) -> Float32:
 def is_depth(message: Any, topic: str) -> bool:
     """Whether an image message holds depth rather than a picture."""
     if _is_compressed(message):
-        return "compressedDepth" in message.format or ("16UC1" in message.format and "depth" in topic)
+        return "compressedDepth" in message.format or ("16UC1" in message.format and "depth" in topic.lower())
     if message.encoding == "mono16":
-        return "depth" in topic
+        return "depth" in topic.lower()
     return message.encoding in _DEPTH_ENCODINGS
 
 

@@ -16,7 +16,8 @@ from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, folder_calibration
 from improvo.geometry.trajectory_files import clean_poses
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.images import IMAGE_SUFFIXES, read_depth, read_image
+from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.images import IMAGE_SUFFIXES, read_depth
 from improvo.sequences.rates import depth_scale, frame_rate
 from improvo.sequences.scannet_folder import read_matrix
 from improvo.types import Float32, Trajectory, UInt8
@@ -37,9 +38,9 @@ class SevenScenes(Recording):
         if not found:
             raise InputError(f"{path}: has no frame-NNNNNN.color.png files, so it is no 7-Scenes sequence")
         self._numbers = sorted(found)
-        self._images = [found[number] for number in self._numbers]
+        self._images = ImageFiles((found[number] for number in self._numbers), path)
         self.calibration = self.own_calibration(lambda: folder_calibration(path))
-        notes: list[str] = []
+        notes = list(self._images.notes)
         has_depth = any(self._beside(row, "depth.png").is_file() for row in range(min(len(self._images), 10)))
         if self.calibration is None and self.calibration_error is None:
             self.calibration = Calibration("7-Scenes default", (525.0, 525.0, 319.5, 239.5), size=(640, 480))
@@ -58,17 +59,17 @@ class SevenScenes(Recording):
         return path.is_dir() and next(_colour_files(path), None) is not None
 
     def source(self, index: int) -> str:
-        return str(self._images[index])
+        return str(self._images.files[index])
 
     def image(self, index: int) -> UInt8:
-        return read_image(self._images[index])
+        return self._images.read(index)
 
     def depth(self, index: int) -> Float32 | None:
         file = self._beside(index, "depth.png")
         return read_depth(file, self._scale) if file.is_file() else None
 
     def _beside(self, index: int, ending: str) -> Path:
-        image = self._images[index]
+        image = self._images.files[index]
         return image.with_name(f"{image.name.split('.')[0]}.{ending}")
 
     def _read_poses(self) -> tuple[Trajectory | None, list[str]]:

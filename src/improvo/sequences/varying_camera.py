@@ -14,6 +14,7 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration
+from improvo.geometry.text_files import decoded
 from improvo.geometry.trajectory_files import clean_poses
 from improvo.types import Float64, Trajectory
 
@@ -73,7 +74,7 @@ def read_json(path: Path, data: bytes | None = None) -> dict[str, Any]:
         InputError: not JSON, or no mapping.
     """
     try:
-        content = json.loads(path.read_bytes() if data is None else data)
+        content = json.loads(decoded(path.read_bytes() if data is None else data))
     except (OSError, ValueError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise InputError(f"{path}: cannot be read as JSON ({reason}); export it again") from None
