@@ -6,9 +6,9 @@ become (2b - 1) / sqrt(number of bits), for which the squared distance is 4 x (s
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from improvo.compiled import compiled
 from improvo.types import Features, Float32, Int64
 
 RANDOM_DISTANCE = float(np.sqrt(2.0))  # expected distance of two unrelated unit descriptors
@@ -49,7 +49,7 @@ def match_units(a: Float32, b: Float32, max_distance: float | None = None) -> In
     """As `mutual_nearest_neighbours`, on unit vectors (N, D) and (M, D), without scaling the threshold."""
     if len(a) == 0 or len(b) == 0:
         return np.zeros((0, 2), np.int64)
-    nearest_in_b, nearest_in_a, best = _nearest_both_ways(a @ b.T)
+    nearest_in_b, nearest_in_a, best = nearest_both_ways(a @ b.T)
     rows = np.flatnonzero(nearest_in_a[nearest_in_b] == np.arange(len(a)))
     if max_distance is not None:
         # ||x - y||^2 = 2 - 2 x.y for unit vectors
@@ -57,11 +57,17 @@ def match_units(a: Float32, b: Float32, max_distance: float | None = None) -> In
     return np.stack([rows, nearest_in_b[rows]], axis=1)
 
 
-def without_strays(matches: Int64, keypoints_a: Float32, keypoints_b: Float32, limit: float) -> Int64:
+def without_flow_outliers(matches: Int64, keypoints_a: Float32, keypoints_b: Float32, limit: float) -> Int64:
     """The pairs (K, 2) whose motion is at most `limit` pixels from the median motion of all.
 
-    Between frames of a video nothing jumps, so a pair far from what all others do is a mistaken identity. The median
-    goes along with a camera that turns fast.
+    Points move little between two frames of a video. A pair that moves very differently from the others is a wrong
+    match. The median follows a camera that turns fast.
+
+    Args:
+        matches: (K, 2) rows of `keypoints_a` and of `keypoints_b`.
+        keypoints_a: (N, 2) pixels.
+        keypoints_b: (M, 2) pixels.
+        limit: pixels.
     """
     if len(matches) == 0:
         return matches
@@ -69,8 +75,8 @@ def without_strays(matches: Int64, keypoints_a: Float32, keypoints_b: Float32, l
     return matches[np.linalg.norm(motion - np.median(motion, axis=0), axis=1) <= limit]
 
 
-@numba.njit(cache=True, nogil=True)
-def _nearest_both_ways(similarity):  # type: ignore[no-untyped-def]
+@compiled
+def nearest_both_ways(similarity):  # type: ignore[no-untyped-def]
     """Largest entry of each row and of each column in one pass (the first of equals), and the rows' largest values.
 
     NumPy's argmax over columns alone costs as much as the product of the matrices.
