@@ -22,6 +22,15 @@ _SEQUENCE_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("end", {"type": int, "metavar": "N", "help": "one past the last frame (default: all)"}),
     ("stride", {"type": int, "metavar": "N", "help": "every n-th frame (default: 1)"}),
     ("max-frames", {"type": int, "metavar": "N", "help": "at most so many, after the stride (default: all)"}),
+    (
+        "undistorted-fov",
+        {
+            "type": float,
+            "metavar": "DEGREES",
+            "help": "how much of a distorted wide lens is seen (default: all up to 120, beyond that what keeps the "
+            "resolution in the middle)",
+        },
+    ),
     ("width", {"type": int, "metavar": "PIXELS", "help": "resize to this width (default: as recorded)"}),
     ("topic", {"metavar": "NAME", "help": "image topic of a ROS bag, or camera of a recording with several"}),
 )

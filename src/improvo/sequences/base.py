@@ -31,6 +31,7 @@ class SequenceSettings:
     end: int | None = None  # one past the last frame of the recording
     stride: int = 1  # every n-th frame
     max_frames: int | None = None  # after the stride
+    undistorted_fov: float | None = None  # degrees of a wide lens that are seen; None keeps the middle's resolution
     width: int | None = None  # resize to this width, keeping the aspect ratio
     topic: str | None = None  # the image topic of a ROS bag, or the camera of a recording with several (cam1, image_3)
 

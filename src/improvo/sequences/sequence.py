@@ -48,7 +48,7 @@ class Sequence:
         if settings.width is not None and settings.width < 8:
             raise InputError(f"{self.path}: width {settings.width} is too small; choose at least 8 pixels")
         calibration = _calibration(recording, settings, width, height)
-        self._rectifier = Rectifier(calibration.camera(width, height), settings.width)
+        self._rectifier = Rectifier(calibration.camera(width, height), settings.width, settings.undistorted_fov)
 
     @property
     def camera(self) -> Camera:
