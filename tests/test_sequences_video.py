@@ -78,7 +78,7 @@ def test_mp4_without_its_index_is_a_one_line_error(tmp_path: Path) -> None:
     write_video(tmp_path / "v.mp4", images(COUNT), codec="mp4v")
     data = (tmp_path / "v.mp4").read_bytes()
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) // 2])
-    with pytest.raises(InputError, match=r"cut.mp4: cannot be opened as a video"):
+    with pytest.raises(InputError, match=r"cut.mp4: has no index, so the recording was cut off"):
         open_sequence(tmp_path / "cut.mp4", fov=60.0)
 
 

@@ -81,5 +81,6 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
 def _camera(camera: dict[str, Any]) -> str:
     text = f"fx {camera['fx']:.6g}, fy {camera['fy']:.6g}, cx {camera['cx']:.6g}, cy {camera['cy']:.6g}"
     if camera["distortion"]:
-        text += f", {camera['distortion_model']} {[round(value, 5) for value in camera['distortion']]}"
+        values = ", ".join(f"{value:.9g}" for value in camera["distortion"])
+        text += f", {camera['distortion_model']} [{values}]"
     return text

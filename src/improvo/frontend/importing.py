@@ -133,7 +133,9 @@ def convert(tensors: Tensors, source: str, licence: str) -> tuple[Weights, Layou
     if len(prefixes) > 1:
         named = ", ".join(f"`{prefix}`" for prefix in prefixes)
         raise InputError(f"{source}: holds {len(prefixes)} networks, under {named}; save the one that you mean alone")
-    tensors = {name.removeprefix(prefixes[0]): values for name, values in tensors.items() if name.startswith(prefixes[0])}
+    tensors = {
+        name.removeprefix(prefixes[0]): values for name, values in tensors.items() if name.startswith(prefixes[0])
+    }
     try:
         ours: dict[str, Float32] = {}
         for layer, (convolution, norm) in layout.names.items():

@@ -68,6 +68,9 @@ def open_recording(path: Path | str, settings: SequenceSettings | None = None, *
     if settings.format == "auto":
         chosen = next((recording for recording in _formats() if recording.recognises(path)), None)
         if chosen is None:
+            other = _unread_pictures(path)
+            if other is not None:
+                raise InputError(f"{path}: holds {other} files, which are not read; convert them to JPEG or PNG")
             raise InputError(
                 f"{path}: not recognised as any of {', '.join(format_names())}; name it with --format if it is one"
             )
@@ -81,6 +84,13 @@ def open_recording(path: Path | str, settings: SequenceSettings | None = None, *
         raise InputError(
             f"{error.filename or path}: {error.strerror or error}; check the path and permissions"
         ) from None
+
+
+def _unread_pictures(path: Path) -> str | None:
+    """The kind of picture that a folder holds and that no reader reads; None without."""
+    kinds = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".jxl", ".exr", ".gif", ".raw"}
+    suffixes = {file.suffix.lower() for file in path.iterdir()} & kinds if path.is_dir() else set()
+    return next(iter(sorted(suffixes)), None)
 
 
 def format_names() -> list[str]:

@@ -24,9 +24,10 @@ class ExportedFeatures:
     An image is found by the tail of its path, longest first (`redkitchen/frame-000000.color.png` before
     `frame-000000.color.png`), by `SEQUENCE/000000` or `SEQUENCE/000000.png` (number in the recording, as
     `--export-images` writes it), or, if the export holds one sequence, by `000000` alone. Where the recording's own
-    names are numbers too, and others, the names that more of the export fits are taken. NPZ files have that name with
-    `.npz` appended to or in place of the suffix; an HDF5 file has it as a group. Keypoints (N, 2) are in pixels of the frame as delivered (undistorted, resized), centre of the top-left
-    pixel (0, 0); descriptors are (N, D), in HDF5 (D, N) as hloc writes them; scores (N,) are optional.
+    names are other numbers, those are taken that more of the export fits. NPZ files have that name with `.npz` appended
+    to or in place of the suffix; an HDF5 file has it as a group. Keypoints (N, 2) are in pixels of the frame as
+    delivered (undistorted, resized), centre of the top-left pixel (0, 0); descriptors are (N, D), in HDF5 (D, N) as
+    hloc writes them; scores (N,) are optional.
     """
 
     path: str  # a folder, or an HDF5 file
