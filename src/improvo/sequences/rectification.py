@@ -66,15 +66,15 @@ class Rectifier:
             parts.append(f"resized to {self.camera.width}x{self.camera.height}")
         return ", ".join(parts) or "as recorded"
 
-    def image(self, grey: UInt8) -> UInt8:
-        """Raw grey (H, W) -> delivered grey; sampling bilinear, shrinking by pixel area."""
+    def image(self, image: UInt8) -> UInt8:
+        """Raw image (H, W) or (H, W, C) -> delivered; sampling bilinear, shrinking by pixel area."""
         if self._maps is not None:
-            grey = cv2.remap(grey, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            image = cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         size = (self.camera.width, self.camera.height)
-        if size != (grey.shape[1], grey.shape[0]):
-            shrinks = size[0] < grey.shape[1]
-            grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-        return np.ascontiguousarray(grey)
+        if size != (image.shape[1], image.shape[0]):
+            shrinks = size[0] < image.shape[1]
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        return np.ascontiguousarray(image)
 
     def depth(self, depth: Float32) -> Float32:
         """Raw depth (H, W) -> depth of the delivered frame by nearest pixel, so that edges are not mixed."""

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from improvo.errors import InputError
@@ -115,6 +116,23 @@ class Sequence:
             frame = self._frame(int(index))
             if frame is not None:
                 yield frame
+
+    def colour(self, i: int) -> UInt8:
+        """The i-th selected frame in colour, (H, W, 3) RGB, same geometry as its grey image.
+
+        Three equal channels where the recording has no colour.
+
+        Raises:
+            IndexError: there is no such row.
+            InputError: the frame cannot be decoded.
+        """
+        index = int(self.indices[i])
+        try:
+            image = self._rectifier.image(self._raw_image(index))
+        except UnreadableFrameError as error:
+            raise InputError(f"{self.recording.source(index)}: {error}; leave this frame out") from None
+        code = cv2.COLOR_GRAY2RGB if image.ndim == 2 or image.shape[2] == 1 else cv2.COLOR_BGR2RGB
+        return np.asarray(cv2.cvtColor(image[..., :3] if image.ndim == 3 else image, code))
 
     def row(self, frame: Frame) -> int:
         """The row of a delivered frame in `times` and `ground_truth`, and the argument of `depth` for it."""
