@@ -35,9 +35,9 @@ def run(arguments: argparse.Namespace) -> None:
     make_output_folder(arguments.output, "export colmap")
     for number, segment in enumerate(segments):
         model = segment_model(run_folder, segment, arguments.max_error, arguments.min_observations)
-        grey = None if arguments.no_images else write_images(run_folder, model, arguments.output / "images")
+        colours = None if arguments.no_images else write_images(run_folder, model, arguments.output / "images")
         target = arguments.output / "sparse" / str(number)
-        write_colmap(model, run_folder.camera, target, grey)
+        write_colmap(model, run_folder.camera, target, colours)
         print(
             f"{target}: {len(model.frames)} images, {len(model.xyz)} points, {len(model.error)} observations, "
             f"mean re-projection error {model.mean_error:.6f} px"

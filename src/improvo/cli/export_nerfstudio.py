@@ -23,8 +23,8 @@ def run(arguments: argparse.Namespace) -> None:
     segments = segments_by_length(run_folder)
     make_output_folder(arguments.output, "export nerfstudio")
     model = segment_model(run_folder, segments[0], arguments.max_error, arguments.min_observations)
-    grey = write_images(run_folder, model, arguments.output / "images")
-    write_nerfstudio(model, run_folder.camera, arguments.output, grey)
+    colours = write_images(run_folder, model, arguments.output / "images")
+    write_nerfstudio(model, run_folder.camera, arguments.output, colours)
     print(f"{arguments.output / 'transforms.json'}: {len(model.frames)} images, {len(model.xyz)} points")
     if len(segments) > 1:
         left = run_folder.frames - len(model.frames)

@@ -103,19 +103,19 @@ def image_name(position: int) -> str:
 
 
 def write_images(run: RunFolder, model: Model, folder: Path) -> UInt8:
-    """Write the frames, undistorted as the run saw them; returns the grey value (P,) of each point where first seen."""
+    """Write the frames, undistorted as the run saw them; returns the RGB (P, 3) of each point where first seen."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from None
-    grey = np.full(len(model.xyz), 128, np.uint8)
+    colours = np.full((len(model.xyz), 3), 128, np.uint8)
     first = np.flatnonzero(np.diff(model.point, prepend=-1))
     pixels = np.rint(model.keypoints[first]).astype(np.int64)
     for row, position in enumerate(tqdm(model.frames.tolist(), unit="frame", desc="images", disable=None)):
-        image = run.image(position)
-        write_png(folder / image_name(position), image[..., None].repeat(3, axis=2))
+        image = run.colour(position)
+        write_png(folder / image_name(position), image)
         here = np.flatnonzero(model.frame[first] == row)
         v = np.clip(pixels[here, 1], 0, image.shape[0] - 1)
         u = np.clip(pixels[here, 0], 0, image.shape[1] - 1)
-        grey[model.point[first[here]]] = image[v, u]
-    return grey
+        colours[model.point[first[here]]] = image[v, u]
+    return colours

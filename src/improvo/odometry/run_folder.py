@@ -134,6 +134,14 @@ class RunFolder:
         Raises:
             InputError: there is no such frame in the run or in the recording.
         """
+        return self.sequence[self._row(frame_index)].image
+
+    def colour(self, frame_index: int) -> UInt8:
+        """The same in colour, (H, W, 3) RGB; three equal channels where the recording has none."""
+        return self.sequence.colour(self._row(frame_index))
+
+    def _row(self, frame_index: int) -> int:
+        """The row of the recording's sequence that a processed frame is."""
         if not 0 <= frame_index < self.frames:
             raise InputError(f"{self.path}: has no frame {frame_index}; frames are 0 to {self.frames - 1}")
         row = self._row_of_index.get(self.source_index[frame_index])
@@ -141,7 +149,7 @@ class RunFolder:
             raise InputError(
                 f"{self.sequence.path}: has no frame {self.source_index[frame_index]}; is it the recording?"
             )
-        return self.sequence[row].image
+        return row
 
     @cached_property
     def _first_rows(self) -> tuple[Int64, Int64]:
