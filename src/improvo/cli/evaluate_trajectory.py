@@ -106,14 +106,19 @@ def read_pair(
             without times of which the other has another number.
     """
     from improvo.geometry.trajectory_files import has_times, read_trajectory_report
-    from improvo.sequences import open_sequence
+    from improvo.odometry.run_folder import RunFolder, why_no_pose
+    from improvo.sequences.opening import true_trajectory
 
+    if (estimate_path / "run.json").is_file():
+        without = why_no_pose(RunFolder(estimate_path).report)
+        if without is not None:
+            raise InputError(f"{estimate_path}: {without}")
     estimate_path = estimate_path / "trajectory.txt" if estimate_path.is_dir() else estimate_path
     if not estimate_path.exists():
         raise InputError(f"{estimate_path}: no such file; give a trajectory file or the output folder of `improvo run`")
     counted = not has_times(estimate_path)
     if truth_path.is_dir():
-        truth, truth_notes = open_sequence(truth_path, sequence).ground_truth, tuple[str, ...]()
+        truth, truth_notes = true_trajectory(truth_path, sequence), tuple[str, ...]()
         if truth is None:
             raise InputError(f"{truth_path}: has no true poses; give a trajectory file or a sequence that has them")
     else:

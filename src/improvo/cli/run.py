@@ -65,6 +65,8 @@ def run(arguments: argparse.Namespace) -> int:
         f"{sequence.name}: {sequence.format}, {frames} of {camera.width}x{camera.height}; "
         f"frontend {settings.frontend.name}; poses and map are up to scale"
     )
+    for note in sequence.notes:
+        print(f"note: {note}")
     summary = _track(sequence, arguments.output, settings, _viewer(arguments))
     _print_summary(summary)
     if arguments.report:
@@ -102,6 +104,8 @@ def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: Visu
 
 
 def _print_summary(summary: RunSummary) -> None:
+    from improvo.odometry.run_folder import why_no_pose
+
     report = summary.report
     frames, segments = report["frames"], report["segments"]
     print(
@@ -120,4 +124,8 @@ def _print_summary(summary: RunSummary) -> None:
         print(f"  {len(skipped)} frame(s) could not be read, first {skipped[0]['source']}: {skipped[0]['reason']}")
     if report["interrupted"]:
         print("  interrupted: the result ends there, and is complete up to there")
+    without = why_no_pose(report)
+    if without is not None:
+        print(f"{without}; details in {summary.folder / 'run.json'}")
+        return
     print(f"results in {summary.folder}; `improvo show map {summary.folder}` draws them")

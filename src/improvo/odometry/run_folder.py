@@ -21,6 +21,10 @@ from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, Trac
 from improvo.types import Float64, Int64, SparseMap, Trajectory, UInt8
 
 _FORMER_KINDS = {"waiting": "initialising"}  # of events
+_MENDS = {  # by a word of the reason
+    "parallax": "the camera turned or stood still: move it sideways at the start (`improvo info` shows what it sees)",
+    "match": "`improvo info` tells whether the pictures are dark, blurred or without texture",
+}
 _PLY_TYPES = {"float": "<f4", "double": "<f8", "int": "<i4", "uint": "<u4", "uchar": "u1", "short": "<i2"}
 
 
@@ -205,6 +209,16 @@ class RunFolder:
             frame_index - self.birth[rows],
             self.stability_of_rows[rows],
         )
+
+
+def why_no_pose(report: dict[str, Any]) -> str | None:
+    """Why no frame of a run has a pose, and what helps, from its run.json; None where some have."""
+    if report["frames"]["tracked"]:
+        return None
+    details = [str(event["detail"]) for event in report["events"] if event["kind"] == "initialising"]
+    reason = details[-1] if details else "the run ended before a map could start"
+    mend = next((mend for word, mend in _MENDS.items() if word in reason), _MENDS["match"])
+    return f"no frame has a pose: {reason}; {mend}"
 
 
 def _with_present_names(report: dict[str, Any]) -> dict[str, Any]:

@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from improvo.errors import ConfigError, InputError
+from improvo.sequences.association import poses_at
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
 from improvo.sequences.live import LiveStream, is_live
 from improvo.sequences.live_sequence import LiveSequence
-from improvo.sequences.sequence import Sequence
+from improvo.sequences.sequence import Sequence, selected
+from improvo.types import Trajectory
 
 ENTRY_POINT = "improvo.recordings"  # the group under which other packages offer their readers
 
@@ -52,6 +54,20 @@ def open_sequence(path: Path | str, settings: SequenceSettings | None = None, **
     if isinstance(recording, LiveStream):
         return LiveSequence(recording, settings)
     return Sequence(recording, settings)
+
+
+def true_trajectory(path: Path | str, settings: SequenceSettings | None = None, **overrides: Any) -> Trajectory | None:
+    """True poses at the times of the selected frames, None where the recording has none; needs no calibration.
+
+    Arguments and errors as `open_sequence`.
+    """
+    settings = _with_overrides(settings, overrides)
+    recording = open_recording(path, settings)
+    if isinstance(recording, LiveStream):
+        recording.close()
+        return None
+    times = recording.times[selected(recording, settings)]
+    return None if recording.ground_truth is None else poses_at(recording.ground_truth, times)
 
 
 def open_recording(path: Path | str, settings: SequenceSettings | None = None, **overrides: Any) -> Recording:

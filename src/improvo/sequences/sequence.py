@@ -33,7 +33,7 @@ class Sequence:
     """
 
     def __init__(self, recording: Recording, settings: SequenceSettings) -> None:
-        self.indices = _selected(recording, settings)  # (N,) rows of the recording
+        self.indices = selected(recording, settings)  # (N,) rows of the recording
         height, width = _probe(recording, self.indices).shape[:2]
         self._set_up(recording, settings, width, height)
 
@@ -188,7 +188,7 @@ def _image_or_reason(recording: Recording, index: int) -> tuple[UInt8 | None, st
         return None, str(error)
 
 
-def _selected(recording: Recording, settings: SequenceSettings) -> Int64:
+def selected(recording: Recording, settings: SequenceSettings) -> Int64:
     """The recording's rows that the settings ask for.
 
     Raises:
