@@ -52,10 +52,10 @@ def _write_point_cloud(model: Model, colours: UInt8, path: Path) -> None:
     )
     for name, column in zip("xyz", model.xyz.T, strict=True):
         vertices[name] = column
-    for name, channel in zip(("red", "green", "blue"), colours.T, strict=True):
-        vertices[name] = channel
+    for channel, name in enumerate(("red", "green", "blue")):
+        vertices[name] = colours[:, channel]
     kinds = "".join(f"property float {name}\n" for name in "xyz")
-    colours = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{kinds}{colours}end_header\n"
+    shades = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{kinds}{shades}end_header\n"
     with written_atomically(path) as temporary:
         temporary.write_bytes(header.encode() + vertices.tobytes())

@@ -15,13 +15,13 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.geometry.camera_files import folder_calibration
 from improvo.geometry.time_units import in_seconds, unit_of
-from improvo.geometry.trajectory_files import increasing_order, read_times, read_trajectory_report
+from improvo.geometry.trajectory_files import has_times, increasing_order, read_times, read_trajectory_report
 from improvo.sequences.base import Recording, SequenceSettings
 from improvo.sequences.image_files import ImageFiles
 from improvo.sequences.image_kinds import one_kind
 from improvo.sequences.images import list_images
 from improvo.sequences.rates import frame_rate
-from improvo.types import Float64, UInt8
+from improvo.types import Float64, Trajectory, UInt8
 
 _CALENDAR = re.compile(r"20\d\d(0[1-9]|1[0-2])([0-2]\d|3[01])([01]\d|2[0-3])[0-5]\d")  # 202609011230...: no count
 _SUBFOLDERS = ("images", "image", "rgb", "color", "colour", "frames", "imgs", "left", "cam0")
@@ -42,6 +42,9 @@ class ImageFolder(Recording):
         self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: folder_calibration(extras))
         times_file = next((f / "times.txt" for f in (path, extras) if (f / "times.txt").is_file()), None)
         stamps = _stamps_in_names(files)
+        truth_file = next((f for f in (path / "groundtruth.txt", extras / "groundtruth.txt") if f.is_file()), extras)
+        truth, problems = read_trajectory_report(truth_file) if truth_file.is_file() else (None, ())
+        notes += problems
         if times_file is not None and settings.fps is None:
             times, said = read_times(times_file)
             notes += said
@@ -59,12 +62,13 @@ class ImageFolder(Recording):
             notes.append(f"{path}: the names of the files are taken as time stamps in {unit or 'seconds'}")
         else:
             rate, note = frame_rate(self.calibration, settings)
-            notes += [f"{path}: {note}"] if note else []
             self.times = _frame_numbers(files) / rate
-        truth = next((f / "groundtruth.txt" for f in (path, extras) if (f / "groundtruth.txt").is_file()), None)
-        if truth is not None:
-            self.ground_truth, problems = read_trajectory_report(truth)
-            notes += problems
+            if note is not None and truth is not None and len(truth) == len(files) and has_times(truth_file):
+                self.times, note = truth.times, f"has no time stamps; those of {truth_file.name} are taken, row by row"
+            notes += [f"{path}: {note}"] if note else []
+        if truth is not None and not has_times(truth_file) and len(truth) == len(files):
+            truth = Trajectory(self.times, truth.world_from_cam, truth.segment)
+        self.ground_truth = truth
         self._images = ImageFiles(files, path)
         self.notes = (*notes, *self._images.notes)
 

@@ -33,6 +33,7 @@ FORMATS: dict[str, str] = {
     "tum": "improvo.sequences.tum_rgbd:TumRgbd",
     "euroc": "improvo.sequences.euroc:EurocMav",
     "kitti": "improvo.sequences.kitti_odometry:KittiOdometry",
+    "kitti-raw": "improvo.sequences.kitti_raw:KittiRaw",
     "video": "improvo.sequences.video_file:VideoFile",
     "images": "improvo.sequences.image_folder:ImageFolder",
 }
