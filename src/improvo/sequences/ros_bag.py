@@ -19,7 +19,8 @@ from improvo.geometry.camera_files import Calibration
 from improvo.geometry.trajectory_files import increasing_order
 from improvo.sequences import ros_messages
 from improvo.sequences.association import nearest
-from improvo.sequences.base import Recording, SequenceSettings
+from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
+from improvo.sequences.grey_levels import SAMPLES, Stretch, stretch_of, to_8_bits
 from improvo.sequences.ros_topics import Stream, candidates, deserialized, guarded, open_reader
 from improvo.types import Float32, Int64, Trajectory, UInt8
 
@@ -52,6 +53,8 @@ class RosBag(Recording):
         self._rows, self.times = order, stamps[order]
         self.calibration = self.own_calibration(lambda: _camera_info(self._reader, self._images.topic, path))
         self._depths = depths
+        self._stretch = self._common_stretch()
+        notes += [f"{path}: {self._stretch.note}"] if self._stretch is not None else []
         self._notes = notes
 
     @property
@@ -86,7 +89,22 @@ class RosBag(Recording):
         return f"{self.path}#{self._images.topic}/{index}"
 
     def image(self, index: int) -> UInt8:
+        return to_8_bits(self._picture(index), self._stretch)
+
+    def _picture(self, index: int) -> np.ndarray:
         return ros_messages.image(self._images.message(int(self._rows[index])))
+
+    def _common_stretch(self) -> Stretch | None:
+        """The range of deep pictures; read from a few of them, where the first is deep."""
+        pictures = []
+        for row in np.unique(np.linspace(0, len(self.times) - 1, min(SAMPLES, len(self.times))).astype(int)).tolist():
+            try:
+                pictures.append(self._picture(row))
+            except UnreadableFrameError:  # any message may be damaged
+                continue
+            if pictures[-1].dtype == np.uint8:
+                return None
+        return stretch_of(pictures)
 
     def depth(self, index: int) -> Float32 | None:
         if self._depth is None:

@@ -13,7 +13,7 @@ from improvo.geometry.camera_files.distortion import MODEL_NAMES, normalised
 from improvo.geometry.se3 import rigid, rotation_from_quat_xyzw
 from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.images import decode, depth_in_metres
-from improvo.types import Float32, Float64, UInt8
+from improvo.types import Float32, Float64
 
 # encoding -> dtype, channels, conversion to grey or BGR
 _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
@@ -53,18 +53,16 @@ def header_stamp(data: bytes, ros2: bool) -> int:
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
-def image(message: Any) -> UInt8:
-    """The picture of an Image or CompressedImage, (H, W) grey or (H, W, 3) BGR.
+def image(message: Any) -> np.ndarray:
+    """The picture of an Image or CompressedImage, (H, W) grey or (H, W, 3) BGR, 8 or 16 bits.
 
     Raises:
         UnreadableFrameError: an encoding that is not known, or fewer bytes than the header says.
     """
     if _is_compressed(message):
-        return decode(bytes(message.data), cv2.IMREAD_ANYCOLOR).astype(np.uint8, copy=False)
+        return decode(bytes(message.data), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     pixels, conversion = _pixels(message)
-    if pixels.dtype == np.uint16:
-        pixels = (pixels >> 8).astype(np.uint8)
-    elif pixels.dtype != np.uint8:
+    if pixels.dtype not in (np.uint8, np.uint16):
         raise UnreadableFrameError(f"encoding {message.encoding} is no picture; choose another --topic")
     return np.ascontiguousarray(pixels) if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
 
