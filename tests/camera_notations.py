@@ -245,6 +245,18 @@ READ: list[tuple[str, str, tuple[float, ...], str, bool]] = [
      "k2": -0.02, "k3": 0.003, "k4": 0.0004, "is_fisheye": True}), FISHEYE, "fisheye", True),
     ("params.json", json.dumps({"w": 752, "h": 480, "fl_x": FX, "fl_y": FY, "cx": CX + 0.5, "cy": CY + 0.5,
      "distortion_params": [BROWN[0], BROWN[1], 0.0125, 0, BROWN[2], BROWN[3]]}), BROWN5, "brown", True),
+    ("svo.yaml", "cameras:\n- camera:\n    label: cam0\n    image_height: 480\n    image_width: 752\n    type: pinhole\n    intrinsics:\n"
+     f"      cols: 1\n      rows: 4\n      data: {list(INTRINSICS)}\n    distortion:\n      type: radial-tangential\n"
+     f"      parameters:\n        cols: 1\n        rows: 4\n        data: {list(BROWN)}\n  T_B_C: {{cols: 4, rows: 4, data: "
+     "[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}\n", BROWN, "brown", True),
+    ("fast_livo.yaml", f"cam_model: Pinhole\ncam_width: 752\ncam_height: 480\nscale: 1.0\ncam_fx: {FX}\ncam_fy: {FY}\n"
+     f"cam_cx: {CX}\ncam_cy: {CY}\ncam_d0: {BROWN[0]}\ncam_d1: {BROWN[1]}\ncam_d2: {BROWN[2]}\ncam_d3: {BROWN[3]}\n", BROWN, "brown", True),
+    ("mast3r.yaml", f"use_calib: True\nwidth: 752\nheight: 480\ncalibration: {[*INTRINSICS, *BROWN5]}\n", BROWN5, "brown", True),
+    ("r3live.yaml", f"r3live_vio:\n   image_width: 752\n   image_height: 480\n   camera_intrinsic: {ROW_MATRIX}\n"
+     f"   camera_dist_coeffs: {list(BROWN5)}\n   camera_ext_R: [1, 0, 0, 0, 1, 0, 0, 0, 1]\n", BROWN5, "brown", True),
+    ("nice_slam.yaml", f"cam:\n  H: 480\n  W: 752\n  fx: {FX}\n  fy: {FY}\n  cx: {CX}\n  cy: {CY}\n  png_depth_scale: 6553.5\n"
+     "  crop_edge: 8\n", (), "brown", True),
+    ("assignments.txt", FX_TO_CY.format("").replace(":", " =") + K1_K2_P1_P2.format("").replace(":", " ="), BROWN, "brown", False),
     ("dso_radtan.txt", f"RadTan {FX} {FY} {CX} {CY} {' '.join(map(str, BROWN))}\n752 480\ncrop\n640 480\n", BROWN, "brown", True),
     ("dso_plain.txt", f"{FX} {FY} {CX} {CY} 0.9\n752 480\ncrop\n640 480\n", (0.9,), "fov", True),
     ("dso_relative.txt", f"{FX / 752!r} {FY / 480!r} {(CX + 0.5) / 752!r} {(CY + 0.5) / 480!r} 0.9\n752 480\nnone\n",

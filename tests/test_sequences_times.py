@@ -130,6 +130,23 @@ def test_trajectories_of_any_program(tmp_path: Path, text: str) -> None:
     np.testing.assert_allclose(trajectory.world_from_cam, poses(COUNT), rtol=0, atol=1e-9)
 
 
+def test_the_names_of_the_columns_say_the_order_of_the_quaternion(tmp_path: Path) -> None:
+    rows = [line.split(" ") for line in trajectory_text(TIMES, 1e9).splitlines()]
+    w_first = [[*row[:4], row[7], *row[4:7]] for row in rows]
+    for name, header, content in (
+        ("a.csv", "#timestamp,p_x,p_y,p_z,q_x,q_y,q_z,q_w", rows),
+        (
+            "b.csv",
+            "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []",
+            w_first,
+        ),
+        ("c.csv", "time,x,y,z,qw,qx,qy,qz", w_first),
+    ):
+        (tmp_path / name).write_text("\n".join([header, *(",".join(row) for row in content)]))
+        trajectory, _ = read_trajectory_report(tmp_path / name)
+        np.testing.assert_allclose(trajectory.world_from_cam, poses(COUNT), rtol=0, atol=1e-9)
+
+
 def test_lists_with_backslashes_and_decimal_commas(tmp_path: Path) -> None:
     write_images(tmp_path / "rgb", images(3), "{:05d}.png")
     (tmp_path / "rgb.txt").write_text("".join(f"0,{25 + i} .\\rgb\\{i:05d}.png\r\n" for i in range(3)))

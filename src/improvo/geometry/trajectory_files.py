@@ -69,7 +69,8 @@ def read_trajectory_report(
     else:
         stamps, unit = (values[:, 0] * 1e-9, None) if format == "euroc" else in_seconds(values[:, 0])
         problems += (f"time stamps are taken as {unit}, by their size",) if unit else ()
-        quat_xyzw = values[:, [5, 6, 7, 4]] if format == "euroc" else values[:, 4:8]
+        w_first = (_quaternion_order(lines) or ("wxyz" if format == "euroc" else "xyzw")) == "wxyz"
+        quat_xyzw = values[:, [5, 6, 7, 4]] if w_first else values[:, 4:8]
         matrices = _from_quaternions(quat_xyzw, values[:, 1:4])
     poses, not_finite, not_rigid = clean_poses(matrices)
     problems += _named("NaN or infinite", line_numbers[not_finite], "line")
@@ -217,6 +218,19 @@ def _guess(lines: list[str], path: Path) -> str:
             return "tum"
         break
     raise InputError(f"{path}: is no trajectory; a row has 8 numbers (TUM, EuRoC) or 12 (KITTI)")
+
+
+def _quaternion_order(lines: list[str]) -> str | None:
+    """`wxyz` or `xyzw` as the names of the columns say it; None where they say nothing."""
+    for line in lines:
+        fields = [field for field in re.split(r"[\s,;#]+", line.lower()) if field and not field.startswith("[")]
+        if fields and _is_number(fields[0]):
+            return None
+        matches = [re.fullmatch(r"(?:q|quat|rot|orientation)\w*?([wxyz])(?:\[\])?", field) for field in fields]
+        order = "".join(match.group(1) for match in matches if match is not None)
+        if order in ("wxyz", "xyzw"):
+            return order
+    return None
 
 
 def _is_number(field: str) -> bool:

@@ -41,6 +41,9 @@ def parse_tree(content: str, path: Path) -> Any:
         except (ValueError, RecursionError) as error:
             if path.suffix.lower() == ".json":
                 raise InputError(f"{path}: is not valid JSON ({error}); {MEND}") from None
+    lines = [line.strip() for line in content.splitlines() if line.strip() and line.strip()[0] not in "#;"]
+    if lines and all(re.fullmatch(r"[A-Za-z_][\w.]*\s*=.*", line) for line in lines):  # INI without a section
+        return _ini(f"[camera]\n{content}", path)
     tree = _yaml(content, path)
     if not isinstance(tree, dict | list) or (isinstance(tree, list) and not any(isinstance(i, dict) for i in tree)):
         raise InputError(f"{path}: holds no `key: value` pairs; {MEND}")

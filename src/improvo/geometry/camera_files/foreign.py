@@ -118,6 +118,26 @@ def _matlab(names: dict[str, Any], _: dict[str, Any]) -> Any:
     return matlab
 
 
+def _vikit(_: dict[str, Any], tree: dict[str, Any]) -> Any:
+    """SVO and FAST-LIVO: `cam_model`, `cam_fx`, and `cam_d0` ... `cam_d3` in OpenCV's order."""
+    own = {normalised(key).removeprefix("cam"): value for key, value in tree.items()}
+    values = [own.pop(f"d{number}") for number in range(4) if f"d{number}" in own]
+    if normalised(own.get("model", "pinhole")) == "atan":
+        return {**own, "omega": values[0] if values else None}
+    return {**own, **({"distortion": values} if values else {})}
+
+
+def _mast3r(names: dict[str, Any], tree: dict[str, Any]) -> Any:
+    """MASt3R-SLAM: `calibration` holds fx, fy, cx, cy and the distortion in one list."""
+    values = numbers(names["calibration"], "calibration")
+    rest = {key: value for key, value in tree.items() if normalised(key) != "calibration"}
+    return {**rest, "intrinsics": list(values[:4]), "distortion": list(values[4:])}
+
+
+def _is_mast3r(names: dict[str, Any], tree: dict[str, Any]) -> Any:
+    return _mast3r(names, tree) if isinstance(names["calibration"], list) else tree
+
+
 def _meshroom(names: dict[str, Any], _: dict[str, Any]) -> Any:
     raise ValueError("Meshroom's cameras.sfm is not read; export the scene as COLMAP and give its cameras.txt")
 
@@ -146,6 +166,8 @@ _TRANSLATIONS = (
     ({"cameradata"}, _depthai),
     ({"radialdistortion", "imagesize"}, _matlab),
     ({"sfmdataversion"}, _meshroom),
+    ({"camfx", "camfy"}, _vikit),
+    ({"calibration"}, _is_mast3r),
     ({"m1", "d1"}, _is_stereo),
     ({"k1", "d1"}, _is_stereo),
 )

@@ -24,7 +24,7 @@ _HARMLESS = re.compile(
     r"|patch|cell|voxel|depth|baseline|bf$|rectif|projectionmatrix|^(r|p|q|t)$|imu|gyro|accel|noise|bias|timeoffset"
     r"|timeshift|rostopic|topic|comment|description|name|serial|vendor|brand|make$|note|firmware|version|flag"
     r"|^t(cam|imu|body|world|velo|lidar|base|robot|vehicle|ego)|t(cam|imu)\d?$|estimate|extrins|rotation|translat|transform|pose|^t(bs|camimu|cncnm1|ci|ic|sb|bc|cb)$|pixelsize|physical"
-    r"|new(width|height)|output|target|shutter|lensposition|lensmodel$|lens(serial|make|info|spec)|focallengthmm"
+    r"|new(width|height)|output|target|shutter|lensposition|lensmodel$|lens(serial|make|info|spec)|focallengthmm|crop(edge|size)"
     r"|camoverlaps|distance|doruntimeundistort|^cmaes|^path|file"
 )
 _SURELY = re.compile(

@@ -10,15 +10,15 @@ from improvo.geometry.camera_files.keys import Keys, numbers
 
 _MATRIX = (
     *("cameramatrix", "k", "intrinsicmatrix", "intrinsicsmatrix", "mtx", "cameraintrinsicmatrix", "kmatrix"),
-    *("calibrationmatrix", "matrix", "intrinsics", "intrinsic", "cameraintrinsics", "m"),
+    *("calibrationmatrix", "matrix", "intrinsics", "intrinsic", "cameraintrinsics", "cameraintrinsic", "m"),
 )
-_LIST = ("intrinsics", "intrinsic", "cameraintrinsics", "params", "calibration")
+_LIST = ("intrinsics", "intrinsic", "cameraintrinsics", "cameraintrinsic")
 _FX, _FY = ("fx", "fu", "flx", "focallengthx", "focalx"), ("fy", "fv", "fly", "focallengthy", "focaly")
 _CX, _CY = ("cx", "cu", "u0", "ppx", "principalpointx"), ("cy", "cv", "v0", "ppy", "principalpointy")
 _COEFFICIENTS = (
     *("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff", "distcoefs", "distcoef"),
     *("distortioncoeff", "distortioncoefs", "distortion", "dist", "d", "distortionparameters", "distortionparams"),
-    *("distparams", "distcoefficients", "coeffs", "coefficients", "kc", "disto"),
+    *("distparams", "distcoefficients", "cameradistcoeffs", "coeffs", "coefficients", "kc", "disto"),
 )
 _BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "taux", "tauy")
 _TYPES_OF_SENSOR = {"camera", "rgb", "color", "colour", "mono", "monocular", "gray", "grey", "cmos", "ccd", "visual"}
@@ -46,7 +46,10 @@ def one_camera(keys: Keys, source: str) -> Calibration:
     model = _model(keys)
     distortion, model = _distortion(keys, model)
     (fx, fy, cx, cy), size = _read_out(keys, (fx, fy, cx, cy), size)
-    fps, depth_scale = keys.positive("fps", "ratehz", "framerate"), keys.positive("depthscale", "depthmapfactor")
+    fps, depth_scale = (
+        keys.positive("fps", "ratehz", "framerate"),
+        keys.positive("depthscale", "depthmapfactor", "pngdepthscale"),
+    )
     skew = keys.number("skew", "alphac")
     if skew is not None and skew != 0:
         raise ValueError(f"skew {skew:g} is not supported; undistort the images first")

@@ -76,7 +76,7 @@ def _nodes(node: Any, name: str, inherited: Pairs, depth: int) -> Iterator[tuple
     own = [(str(key), value) for key, value in node.items() if is_value(value)]
     for key, value in node.items():
         if isinstance(value, dict) and not is_value(value) and normalised(key) in _PARTS:
-            own += [(k if normalised(key) != "roi" else f"roi.{k}", v) for k, v in _flat(value, "")]
+            own += [(_named_in(normalised(key), k), v) for k, v in _flat(value, "")]
     if has_intrinsics({normalised(key) for key, _ in own}):
         below = [(key, value) for key, value in node.items() if not is_value(value) and normalised(key) not in _PARTS]
         rest = [pair for key, value in below for pair in _flat(value, f"{key}.")]
@@ -86,6 +86,14 @@ def _nodes(node: Any, name: str, inherited: Pairs, depth: int) -> Iterator[tuple
         if isinstance(value, dict | list) and not is_value(value):
             inner = f"{name}.{key}" if name else str(key)
             yield from _nodes(value, inner, [*inherited, *own], depth + 1)
+
+
+def _named_in(part: str, key: str) -> str:
+    """What a key of a group means on its own: the `width` of a region of interest, the `type` of a distortion."""
+    if part == "roi":
+        return f"roi.{key}"
+    own_words = {"type": "distortion_model", "model": "distortion_model", "parameters": "distortion_coefficients"}
+    return own_words.get(key, key) if part == "distortion" else key
 
 
 def _flat(node: Any, prefix: str) -> Pairs:
