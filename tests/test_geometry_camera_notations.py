@@ -15,10 +15,13 @@ from camera_notations import (
     BROWN,
     BROWN5,
     BROWN8,
+    CX,
+    CY,
     FILE_STORAGE,
     FISHEYE,
     FX,
     FX_TO_CY,
+    FY,
     GYROFLOW,
     INTRINSICS,
     KITTI_RAW,
@@ -195,3 +198,26 @@ def test_own_camera_yaml_is_what_it_was(tmp_path: Path) -> None:
         "model: pinhole\nwidth: 752\nheight: 480\nfx: 458.654\nfy: 457.296\ncx: 367.215\ncy: 248.375\ndistortion: []\n"
     )
     assert load_calibration(written(tmp_path, "camera.yaml", text)).camera(*SIZE) == Camera(*SIZE, *INTRINSICS)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["458.654,457.296,367.215,248.375", "458.654 457.296 367.215 248.375", "458,654 457,296 367,215 248,375"],
+)
+def test_numbers_after_camera_in_any_spelling(text: str) -> None:
+    assert load_calibration(text).camera(*SIZE) == Camera(*SIZE, *INTRINSICS)
+
+
+def test_replica_keeps_the_scale_of_depth_beside_the_camera(tmp_path: Path) -> None:
+    content = {"camera": {"w": 752, "h": 480, "fx": FX, "fy": FY, "cx": CX, "cy": CY, "scale": 6553.5}}
+    assert load_calibration(written(tmp_path, "cam_params.json", json.dumps(content))).depth_scale == 6553.5
+    content["camera"]["scale"] = 0.5
+    with pytest.raises(InputError, match="`scale` could be"):
+        load_calibration(written(tmp_path, "cam_params.json", json.dumps(content)))
+
+
+def test_arkit_scenes(tmp_path: Path) -> None:
+    camera = load_calibration(written(tmp_path, "1.pincam", f"752 480 {FX} {FY} {CX} {CY}")).camera(*SIZE)
+    assert camera == Camera(*SIZE, *INTRINSICS)
+    with pytest.raises(InputError, match="is no calibration"):
+        load_calibration(written(tmp_path, "2.txt", f"{FX} {FY} {CX} {CY} -0.3 0.1"))

@@ -282,3 +282,14 @@ def test_deep_pictures_in_bags_use_one_range(tmp_path: Path) -> None:
     a, b = np.polyfit(made.images[1].ravel().astype(float), sequence[1].image.ravel().astype(float), 1)
     assert a > 0.95
     assert np.abs(a * made.images[1] + b - sequence[1].image).mean() < 2
+
+
+def test_nerf_synthetic_scenes_say_their_angle_only(tmp_path: Path) -> None:
+    folder = encoders.write_transforms(tmp_path / "s", scene())
+    content = json.loads((folder / "transforms.json").read_text())
+    frames = [{k: f[k] for k in ("file_path", "transform_matrix")} for f in content["frames"]]
+    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 0.98, "frames": frames}))
+    (folder / "transforms.json").unlink()
+    camera = open_sequence(folder).camera
+    assert camera.fx == pytest.approx(48 / np.tan(0.49))
+    assert (camera.cx, camera.cy) == (47.5, 35.5)

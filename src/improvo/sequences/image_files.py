@@ -39,6 +39,11 @@ class ImageFiles:
                 f"{where}: {turned} of {len(noted)} pictures note another rotation (EXIF) than the others; all are "
                 "read as the sensor made them"
             )
+        pages = self._pages()
+        if pages > 1:
+            self.notes.append(
+                f"{where}: {self.files[0].name} holds {pages} pages, and only the first is read; split it"
+            )
         self._stretch = self._common_stretch()
         if self._stretch is not None:
             self.notes.append(f"{where}: {self._stretch.note}")
@@ -56,6 +61,12 @@ class ImageFiles:
 
     def _decoded(self, index: int) -> np.ndarray:
         return decode(file_bytes(self.files[index]), self._flags)
+
+    def _pages(self) -> int:
+        """How many pictures the first file holds, if it is a TIFF."""
+        if not self.files or self.files[0].suffix.lower() not in (".tif", ".tiff") or not self.files[0].is_file():
+            return 1
+        return int(cv2.imcount(str(self.files[0])))
 
     def _common_stretch(self) -> Stretch | None:
         first = next((row for row, file in enumerate(self.files[:SAMPLES]) if _may_be_deep(file)), None)

@@ -15,13 +15,14 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, camera_of
-from improvo.sequences.base import Recording, SequenceSettings
+from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
 from improvo.sequences.image_files import ImageFiles
 from improvo.sequences.images import listed_file, natural_key, read_depth
 from improvo.sequences.rates import frame_rate
 from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
 from improvo.types import Float32, Float64, UInt8
 
+_NAMES = ("transforms.json", "transforms_train.json")
 _NO_LENS = {
     *("frames", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov"),
     *("aabb_scale", "scale", "offset", "aabb", "render_aabb", "sharpness", "colmap_im_id", "applied_scale"),
@@ -37,7 +38,8 @@ class Nerfstudio(Recording):
 
     def __init__(self, path: Path, settings: SequenceSettings) -> None:
         self.path = path
-        file = path / "transforms.json" if path.is_dir() else path
+        inside = (path / name for name in _NAMES if (path / name).is_file())
+        file = next(inside, path / _NAMES[0]) if path.is_dir() else path
         content = read_json(file)
         frames = content.get("frames")
         frames = [f for f in frames if isinstance(f, dict) and f.get("file_path")] if isinstance(frames, list) else []
@@ -50,8 +52,10 @@ class Nerfstudio(Recording):
         unit = numbers(content.get("depth_unit_scale_factor", 0.001), 1)[0]
         self._scale = 1 / unit if unit > 0 else 1000.0
         notes = list(self._images.notes)
+        self._size = _size(content, frames) or _size_of_picture(self._images)
+        if self._size is not None:
+            content = {**content, "w": self._size[0], "h": self._size[1]}
         self.calibration = self.own_calibration(lambda: _calibration(str(file), content, frames, notes))
-        self._size = _size(content, frames)
         rate, note = frame_rate(None, settings)
         notes += [f"{path}: {note}"] if note else []
         self.times = np.arange(len(frames)) / rate
@@ -61,7 +65,7 @@ class Nerfstudio(Recording):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        return path.name == "transforms.json" or (path / "transforms.json").is_file()
+        return path.name in _NAMES or any((path / name).is_file() for name in _NAMES)
 
     def source(self, index: int) -> str:
         return str(self._images.files[index])
@@ -112,6 +116,15 @@ def _size(content: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[int, i
     """Width and height of the images, None where the file does not say."""
     values = numbers([_value(frames[0], content, "w"), _value(frames[0], content, "h")], 2)
     return (int(values[0]), int(values[1])) if np.isfinite(values).all() and (values >= 1).all() else None
+
+
+def _size_of_picture(images: ImageFiles) -> tuple[int, int] | None:
+    """Width and height of the first picture, where the file does not say them (NeRF's synthetic scenes)."""
+    try:
+        height, width = images.read(0).shape[:2]
+    except UnreadableFrameError:
+        return None
+    return width, height
 
 
 def _is_lens(key: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 from improvo.errors import InputError
@@ -84,8 +85,11 @@ def from_numbers(text: str) -> Calibration:
     Raises:
         InputError: not these numbers.
     """
+    parts = text.split()
+    if len(parts) > 1 and "," in text and all(re.fullmatch(r"[+-]?\d*,?\d+", part) for part in parts):
+        text = text.replace(",", ".")  # decimal commas
     try:
-        numbers = [float(part) for part in text.split(",")]
+        numbers = [float(part) for part in re.split(r"[\s,;]+", text.strip().strip(","))]
     except ValueError:
         raise InputError(f"--camera {text}: not all are numbers; {MEND}") from None
     if len(numbers) not in (4, 8, 9, 12):

@@ -57,6 +57,10 @@ class Keys:
         """The key as the file spells it."""
         return self._values[name][0]
 
+    def look(self, name: str) -> Any:
+        """The value under a name, which does not count as read by this."""
+        return self._values[name][1]
+
     def take(self, *names: str) -> Any:
         """The value under the first of these names, now read; None without any."""
         found = self.any_of(*names)
@@ -87,6 +91,11 @@ class Keys:
         """Count these as read: they are known to mean nothing for the camera."""
         self._read.update(names)
 
+    def forget(self, name: str) -> None:
+        """Hide a key from all further readers; where it matters, it counts as unread."""
+        self._read.discard(name)
+        self._values[f"{name} "] = self._values.pop(name)
+
     def agree(self, values: dict[str, float]) -> None:
         """Refuse a file that also says another number under one of these names.
 
@@ -102,7 +111,7 @@ class Keys:
     def unread_that_matter(self) -> Iterator[str]:
         """Keys that nobody read and that could be distortion, a model or a size."""
         for name, (original, value) in self._values.items():
-            if name not in self._read and not _is_nothing(value) and _matters(name, value):
+            if name not in self._read and not _is_nothing(value) and _matters(name.strip(), value):
                 yield original
 
 

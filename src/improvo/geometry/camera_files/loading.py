@@ -32,7 +32,7 @@ def load_calibration(text: str, camera: str | None = None) -> Calibration:
         InputError: no such file, not a calibration, a value that cannot be, or a key that could be distortion, a model
             or a size and is not understood.
     """
-    if re.fullmatch(r"[\s\d.,eE+-]+", text) and "," in text and not Path(text).is_file():
+    if re.fullmatch(r"[\s\d.,;eE+-]+", text) and re.search(r"[,;\s]", text.strip()) and not Path(text).is_file():
         return from_numbers(text)
     path = Path(text)
     if not path.exists() and "#" in text:

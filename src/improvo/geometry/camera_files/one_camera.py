@@ -46,10 +46,10 @@ def one_camera(keys: Keys, source: str) -> Calibration:
     model = _model(keys)
     distortion, model = _distortion(keys, model)
     (fx, fy, cx, cy), size = _read_out(keys, (fx, fy, cx, cy), size)
-    fps, depth_scale = (
-        keys.positive("fps", "ratehz", "framerate"),
-        keys.positive("depthscale", "depthmapfactor", "pngdepthscale"),
-    )
+    if "scale" in keys and (keys.number("scale") or 0.0) < 100:
+        keys.forget("scale")  # of the images, not of depth as in Replica's cam_params.json
+    fps = keys.positive("fps", "ratehz", "framerate")
+    depth_scale = keys.positive("depthscale", "depthmapfactor", "pngdepthscale", "scale")
     skew = keys.number("skew", "alphac")
     if skew is not None and skew != 0:
         raise ValueError(f"skew {skew:g} is not supported; undistort the images first")
@@ -179,7 +179,7 @@ def _model(keys: Keys) -> str:
 
 def _text_only(keys: Keys) -> str | None:
     """`distortion: plumb_bob` (MRPT) names the model; otherwise the key holds coefficients."""
-    value = keys._values["distortion"][1]
+    value = keys.look("distortion")
     return keys.take("distortion") if isinstance(value, str) and not any(c.isdigit() for c in value) else None
 
 
@@ -216,7 +216,7 @@ def _distortion(keys: Keys, model: str) -> tuple[tuple[float, ...], str]:
 
 
 def _is_list(keys: Keys, name: str) -> bool:
-    value = keys._values[name][1]
+    value = keys.look(name)
     return not isinstance(value, str) or any(c.isdigit() for c in value)
 
 

@@ -65,6 +65,10 @@ def from_plain_text(text: str, source: str, wanted: str | None) -> Calibration:
     if len(rows) == 1 and len(rows[0]) in (4, 8, 9, 12):
         values = [float(field) for field in rows[0]]
         return checked(Calibration(source, four(values[:4]), usual_length(tuple(values[4:]), "brown")))
+    if len(rows) == 1 and len(rows[0]) == 6:  # ARKitScenes: width, height, fx, fy, cx, cy
+        width, height, *values = (float(field) for field in rows[0])
+        if width == int(width) > values[2] > 0.2 * width and height == int(height) > values[3] > 0.2 * height:
+            return checked(Calibration(source, four(values), size=(int(width), int(height))))
     shape = f"{len(rows)} rows, the first with {len(rows[0]) if rows else 0} numbers"
     raise ValueError(f"is no calibration of COLMAP, DSO, DPVO or KITTI ({shape})")
 
