@@ -78,7 +78,7 @@ def survey(
         "ground_truth": _truth(sequence, problems),
         **measured,
         "unreadable": [skip.source for skip in sequence.skipped],
-        "notes": list(sequence.notes),
+        "notes": list(sequence.notes if calibrated else recording.notes),
     }
     problems += camera_problems(sequence) if calibrated else []
     problems += picture_problems(facts)

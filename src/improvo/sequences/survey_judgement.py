@@ -11,7 +11,7 @@ from improvo.sequences.sequence import Sequence
 
 DARK, BRIGHT = 30, 225  # median grey levels
 FEW_CORNERS = 60
-STILL_SHARE = 0.02  # of the picture
+STILL_SHARE = 0.01  # of the picture
 _FIELDS = (8.0, 150.0)  # degrees; lenses outside are rare, and slips common
 _OFF_CENTRE = 0.2  # of the picture's side
 _ASPECT = 1.15  # between fx and fy

@@ -20,7 +20,8 @@ _DUPLICATE_WIDTH = 160
 _STILL_WIDTH = 96
 _STILL_LEVELS = 2.0  # deviation of a pixel over the recording that counts as none
 _MOVING_LEVELS = 8.0  # median deviation of a picture whose camera moves
-_STILL_FRAMES = 8  # fewer say nothing
+_STILL_FRAMES = 12  # fewer say nothing
+_STRUCTURE = 6.0  # grey levels of gradient: where there is none, a picture that moves looks the same too
 
 
 def measure(sequence: Sequence, samples: int, progress: Callable[[int], object]) -> dict[str, Any]:
@@ -126,4 +127,7 @@ class _Still:
         deviation = np.sqrt(np.maximum(self._squares / self._count - mean**2, 0.0))
         if np.median(deviation) < _MOVING_LEVELS:
             return 0.0
-        return float(cv2.erode((deviation < _STILL_LEVELS).astype(np.uint8), np.ones((2, 2), np.uint8)).mean())
+        across, down = np.gradient(mean)
+        structured = cv2.dilate((np.hypot(across, down) > _STRUCTURE).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        still = (deviation < _STILL_LEVELS) & structured
+        return float(cv2.erode(still.astype(np.uint8), np.ones((2, 2), np.uint8)).mean())
