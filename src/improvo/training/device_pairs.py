@@ -13,7 +13,7 @@ from improvo.errors import InputError
 from improvo.frontend.architecture import CELL
 from improvo.training.labels import DUSTBIN
 from improvo.training.photometric_batch import augment_batch
-from improvo.training.picture_store import DepthStore, PictureStore
+from improvo.training.picture_store import DepthStore, PictureStore, on_device
 from improvo.training.pictures import Pictures
 from improvo.training.posed import PosedSequence, overlapping_pairs
 from improvo.training.random_views import random_views
@@ -95,7 +95,7 @@ class DevicePairs:
         images = augment_batch(shown, rng, generator, settings.photometric)
         network_input = (images.float() / 255).contiguous(memory_format=torch.channels_last)
         logits = self.detector(network_input)
-        batch = {"images": images, "detector": logits, "scenes": torch.from_numpy(plan.scenes).to(self.device)}
+        batch = {"images": images, "detector": logits, "scenes": on_device(plan.scenes, self.device)}
         if self.stability is not None:
             batch["stability"] = self.stability(network_input[:: settings.stability_every])
         return {**batch, **self._points(plan, logits[: len(plan.rows)].float(), generator)}
@@ -186,10 +186,12 @@ class DevicePairs:
         visible = torch.ones_like(in_a[..., 0], dtype=torch.bool)
         if plan.posed:
             in_b[: plan.posed], visible[: plan.posed] = self._through_depth(plan.rows[: plan.posed], in_a[: plan.posed])
-        sizes = torch.from_numpy(self.store.sizes[plan.rows].astype(np.float32)).to(points)
+        sizes = on_device(self.store.sizes[plan.rows].astype(np.float32), points.device)
         visible = visible & _within(in_a, sizes[:, 0]) & _within(in_b, sizes[:, 1])
         result = _warped(plan.view_from_picture[count:], torch.where(visible[..., None], in_b, 0.0))
-        return result, visible & _within(result, points.new_tensor([[views.width, views.height]]))
+        return result, visible & _within(
+            result, on_device(np.array([[views.width, views.height]], np.float32), points.device)
+        )
 
     def _through_depth(self, rows: Int64, in_a: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels of frames b of pixels (P, N, 2) of frames a, by depth and poses, and whether nothing hides them."""
@@ -197,7 +199,7 @@ class DevicePairs:
         b_from_a = np.linalg.inv(self.poses[rows[:, 1]]) @ self.poses[rows[:, 0]]
         turned = self.K[rows[:, 1]] @ b_from_a[:, :3, :3] @ inverse_K  # pixels of b per pixel of a and unit depth
         moved = (self.K[rows[:, 1]] @ b_from_a[:, :3, 3:])[..., 0]
-        A, t = (torch.from_numpy(part.astype(np.float32)).to(in_a) for part in (turned, moved))
+        A, t = (on_device(part, in_a.device) for part in (turned, moved))
         inverse = self.depths.sample(rows[:, 0], in_a)
         seen = torch.cat([in_a, torch.ones_like(in_a[..., :1])], dim=-1)
         seen = (seen[:, :, None] * A[:, None]).sum(dim=-1) + inverse[..., None] * t[:, None]  # over the depth in a
@@ -218,7 +220,7 @@ def _depth_store(posed: Sequence[PosedSequence], device: torch.device) -> DepthS
 
 def _warped(H: Float64, points: Tensor) -> Tensor:
     """Pixels (B, N, 2) through homographies (B, 3, 3); far outside at and beyond the horizon."""
-    matrix = torch.from_numpy(np.asarray(H, np.float32)).to(points)
+    matrix = on_device(H, points.device)
     seen = torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
     seen = (seen[:, :, None] * matrix[:, None]).sum(dim=-1)  # in full precision whatever a product may use
     depth = seen[..., 2:]

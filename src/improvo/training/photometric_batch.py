@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from improvo.training.picture_store import on_device
 from improvo.training.settings import PhotometricSettings
 
 _RADIUS = 4  # pixels of the blur kernels
@@ -34,7 +35,7 @@ def augment_batch(
         return rng.uniform(size=count) < share
 
     def each(values: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.asarray(values, np.float32)).to(images.device)[:, None, None, None]
+        return on_device(values, images.device)[:, None, None, None]
 
     result = images * _shade(rng, chosen(settings.shade_share), height, width, settings.shade, images.device)
     result = result * _vignette(rng, chosen(settings.vignette_share), height, width, images.device)
@@ -52,7 +53,7 @@ def augment_batch(
     result = torch.where(chance < half, 0.0, torch.where(chance > 1 - half, 255.0, result)).clamp(0, 255)
     rows = np.flatnonzero(chosen(settings.jpeg_share))
     if len(rows):
-        where = torch.from_numpy(rows).to(images.device)
+        where = on_device(rows, images.device)
         quality = rng.integers(*settings.jpeg_quality, len(rows))
         result = result.index_copy(0, where, _compressed(result[where].round(), quality))
     return result.round().to(torch.uint8)
@@ -64,19 +65,19 @@ def _shade(
     """(V, 1, H, W) factors of a few soft ellipses that darken or brighten; 1 where none is chosen."""
     count, most = len(chosen), 4
     h, w = height // 8 + 2, width // 8 + 2
-    axes = rng.uniform(0.1, 0.45, (count, most, 2)) * (w, h)
-    centre = rng.uniform(0, 1, (count, most, 2)) * (w, h)
+    half_axes = rng.uniform(0.1, 0.45, (2, count, most)) * np.reshape((w, h), (2, 1, 1))
+    centre = rng.uniform(0, 1, (2, count, most)) * np.reshape((w, h), (2, 1, 1))
     angle, soft = rng.uniform(0, np.pi, (count, most)), rng.uniform(0.05, 0.4, (count, most))
     present = np.arange(most) < rng.integers(1, most + 1, (count, 1))
-    y, x = np.mgrid[:h, :w].astype(np.float32)
-    dx, dy = x - centre[..., 0, None, None], y - centre[..., 1, None, None]
-    c, s = np.cos(angle)[..., None, None], np.sin(angle)[..., None, None]
-    axes = axes[..., None, None]
-    radius = np.hypot((c * dx + s * dy) / axes[:, :, 0], (c * dy - s * dx) / axes[:, :, 1])
-    inside = np.clip(0.5 + (1 - radius) / (2 * soft[..., None, None]), 0, 1) * present[..., None, None]
-    factor = 1 + inside.max(axis=1) * (chosen * rng.uniform(-strongest, strongest, count))[:, None, None]
-    small = torch.from_numpy(factor[:, None].astype(np.float32)).to(device)
-    return functional.interpolate(small, size=(height, width), mode="bilinear", align_corners=False)
+    strength = np.broadcast_to((chosen * rng.uniform(-strongest, strongest, count))[:, None], (count, most))
+    values = np.stack([*half_axes, *centre, np.cos(angle), np.sin(angle), soft, present, strength])
+    a, b, x, y, c, s, soft_, present_, strength_ = on_device(values, device)[..., None, None]  # (V, most, 1, 1) each
+    dx = torch.arange(w, device=device) - x
+    dy = torch.arange(h, device=device)[:, None] - y
+    radius = torch.hypot((c * dx + s * dy) / a, (c * dy - s * dx) / b)
+    inside = (0.5 + (1 - radius) / (2 * soft_)).clamp(0, 1) * present_
+    factor = 1 + inside.amax(dim=1, keepdim=True) * strength_[:, :1]
+    return functional.interpolate(factor, size=(height, width), mode="bilinear", align_corners=False)
 
 
 def _vignette(rng: np.random.Generator, chosen: np.ndarray, height: int, width: int, device: torch.device) -> Tensor:
@@ -85,7 +86,7 @@ def _vignette(rng: np.random.Generator, chosen: np.ndarray, height: int, width: 
     values = np.stack(
         [rng.uniform(-0.3, 0.3, count), rng.uniform(-0.3, 0.3, count), chosen * rng.uniform(0.1, 0.35, count)]
     )
-    right, down, strength = torch.from_numpy(values.astype(np.float32)).to(device)[:, :, None, None, None]
+    right, down, strength = on_device(values, device)[..., None, None, None]
     x = torch.linspace(-1, 1, width, device=device) - right
     y = torch.linspace(-1, 1, height, device=device)[:, None] - down
     return 1 - strength * (x * x + y * y)
@@ -108,8 +109,8 @@ def _blurred(
     dy = y - (along * np.sin(angle[rows, None]))[..., None, None]
     kernels = np.exp(-(dx * dx + dy * dy) / (2 * sigma[rows, None, None, None] ** 2)).sum(axis=1)
     kernels /= kernels.sum(axis=(1, 2), keepdims=True)
-    weight = torch.from_numpy(kernels[:, None].astype(np.float32)).to(images.device)
-    where = torch.from_numpy(rows).to(images.device)
+    weight = on_device(kernels[:, None], images.device)
+    where = on_device(rows, images.device)
     padded = functional.pad(images[where], (_RADIUS,) * 4, mode="reflect").transpose(0, 1)
     return images.index_copy(0, where, functional.conv2d(padded, weight, groups=len(rows)).transpose(0, 1))
 
@@ -117,11 +118,11 @@ def _blurred(
 def _compressed(images: Tensor, quality: np.ndarray) -> Tensor:
     """What JPEG of a quality (V,) from 1 to 100 leaves of images (V, 1, H, W): the same blocks and rounding."""
     count, _, height, width = images.shape
-    dct = torch.from_numpy(_dct()).to(images)
+    dct = on_device(_dct(), images.device)
     scale = np.where(quality < 50, 5000 / np.maximum(quality, 1), 200 - 2 * quality)
     table = np.array(_QUANTISATION.split(), np.float64).reshape(8, 8)
     steps = np.clip(np.floor((table * scale[:, None, None] + 50) / 100), 1, 255).astype(np.float32)
-    step = torch.from_numpy(steps).to(images.device)[:, None, None]  # (V, 1, 1, 8, 8)
+    step = on_device(steps, images.device)[:, None, None]  # (V, 1, 1, 8, 8)
     blocks = images.view(count, height // 8, 8, width // 8, 8).transpose(2, 3) - 128
     coefficients = ((dct @ blocks @ dct.T) / step).round() * step
     restored = (dct.T @ coefficients @ dct).transpose(2, 3).reshape(images.shape)

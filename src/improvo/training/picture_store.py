@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from improvo.types import Float32, Float64, Int64, UInt8
@@ -42,7 +44,7 @@ class PictureStore:
         picture_from_view = np.asarray(np.linalg.inv(view_from_picture), np.float64)
         rows, picture_from_view = self._suited_level(rows, picture_from_view, width, height)
         device = self.pixels.device
-        H = torch.from_numpy(picture_from_view.astype(np.float32)).to(device)[..., None, None]
+        H = on_device(picture_from_view, device)[..., None, None]
         start, size = self._places(rows)
         x = torch.arange(width, device=device, dtype=torch.float32)
         y = torch.arange(height, device=device, dtype=torch.float32)[:, None]
@@ -72,8 +74,8 @@ class PictureStore:
     def _places(self, rows: Int64) -> tuple[Tensor, Tensor]:
         """First pixel (V, 1, 1) and width, height (V, 2, 1) int64 on the device."""
         device = self.pixels.device
-        start = torch.from_numpy(self.starts[rows]).to(device)[:, None, None]
-        return start, torch.from_numpy(self.sizes[rows]).to(device)[..., None]
+        start = on_device(self.starts[rows], device)[:, None, None]
+        return start, on_device(self.sizes[rows], device)[..., None]
 
 
 class DepthStore:
@@ -98,9 +100,9 @@ class DepthStore:
             rows: (V,) numbers of maps.
         """
         device = self.values.device
-        start = torch.from_numpy(self.starts[rows]).to(device)[:, None]
-        size = torch.from_numpy(self.sizes[rows]).to(device)[:, None]
-        scale = torch.from_numpy(self.scales[rows].astype(np.float32)).to(device)[:, None]
+        start = on_device(self.starts[rows], device)[:, None]
+        size = on_device(self.sizes[rows], device)[:, None]
+        scale = on_device(self.scales[rows], device)[:, None]
         places = (points + 0.5) / scale - 0.5
         within = ((places >= 0) & (places <= size - 1)).all(dim=-1)
         places = torch.where(within[..., None], places, 0.0)
@@ -111,6 +113,12 @@ class DepthStore:
         least, most = corners.amin(dim=0), corners.amax(dim=0)
         smooth = within & (least > 0) & (most < 1.15 * least)
         return torch.where(smooth, torch.lerp(upper, lower, down), 0.0)
+
+
+def on_device(values: NDArray[Any], device: torch.device) -> Tensor:
+    """A small array as float32, or int64 where it holds whole numbers, without waiting for what the device does."""
+    kind = np.int64 if np.issubdtype(values.dtype, np.integer) else np.float32
+    return torch.from_numpy(np.ascontiguousarray(values, kind)).to(device, non_blocking=True)
 
 
 def _starts(sizes: Int64) -> Int64:
