@@ -41,6 +41,7 @@ def agreement(views: torch.Tensor, device: torch.device) -> bool:
         network = network.to(device, memory_format=torch.channels_last)
         good = True
         for precision, (heat, cosine) in TOLERANCE.items():
+            torch.backends.cudnn.allow_tf32 = precision == torch.bfloat16
             with torch.autocast(device.type, torch.bfloat16, enabled=precision == torch.bfloat16):
                 given = network(views.to(device))
             maps = [heat_map(output.detector_logits.float().cpu()) for output in (wanted, given)]

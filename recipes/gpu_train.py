@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 
 from improvo import files
-from improvo.config import from_dict
+from improvo.config import from_dict, to_dict
 from improvo.frontend.weights import find_weights
 from improvo.training.settings import HeldSettings
 
@@ -43,10 +43,7 @@ def settings_of(job: dict[str, Any], plan: dict[str, Any], arguments: argparse.N
     """The settings of one job."""
     given = merged(plan["common"], plan["tiny"] if arguments.tiny else {}, job.get("settings", {}))
     given = merged(given, {"compile": arguments.compile})
-    defaults = HeldSettings()
-    from improvo.config import to_dict
-
-    return from_dict(HeldSettings, merged(to_dict(defaults), given), where=job["name"])
+    return from_dict(HeldSettings, merged(to_dict(HeldSettings()), given), where=job["name"])
 
 
 def run_job(job: dict[str, Any], plan: dict[str, Any], arguments: argparse.Namespace) -> None:
@@ -55,9 +52,12 @@ def run_job(job: dict[str, Any], plan: dict[str, Any], arguments: argparse.Names
 
     from improvo.training.held_training import train_held
     from improvo.training.pack import read_pack
+    from improvo.training.pictures import Pictures
 
     folder: Path = arguments.work / job["name"]
     pictures, posed, data = read_pack(arguments.pack)
+    if arguments.tiny:
+        pictures, posed = Pictures(pictures.sources[:3]), posed[:3]
     settings = settings_of(job, plan, arguments)
     torch.set_float32_matmul_precision("high")
     kind, _, parent = job["start"].rpartition(" ")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -40,8 +41,9 @@ def train_held(
         start: weights to start from, whose detector is held.
         stability_from: weights whose stability head is held to; without it the result has no such head.
         data: what the model card says about the pictures; the sources' names where it is empty.
-        seconds: of training; where given, the number of steps follows from it.
+        seconds: of preparing and training; where given, the number of steps follows from it.
     """
+    begun = time.monotonic()
     parent = load_weights(start)
     stability = load_weights(stability_from) if stability_from else None
     if stability and not stability.architecture.stability:
@@ -65,7 +67,8 @@ def train_held(
         frames=sum(len(sequence.pictures) for sequence in posed),
     )
     card = replace(card, notes="") if stability else card
-    return run_stage(HeldStage(network, settings), batches, settings, output, card, progress, seconds)
+    left = max(seconds - (time.monotonic() - begun), 0.1) if seconds else 0.0
+    return run_stage(HeldStage(network, settings), batches, settings, output, card, progress, left)
 
 
 def network_teacher(weights: Weights, head: str, device: torch.device, precision: torch.dtype) -> Teacher:

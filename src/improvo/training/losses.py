@@ -66,7 +66,9 @@ def info_nce_loss(
         scenes: (B,) int; pairs of the same scene, which may show the same places, are not each other's negatives.
     """
     negative = valid if negative is None else negative
-    near = (torch.cdist(points_a, points_a) < masked_pixels) | (torch.cdist(points_b, points_b) < masked_pixels)
+    # not by matrix products, which may run in low precision
+    far = [torch.cdist(p, p, compute_mode="donot_use_mm_for_euclid_dist") for p in (points_a, points_b)]
+    near = (far[0] < masked_pixels) | (far[1] < masked_pixels)
     if group > 1:  # large pairs, in which only points of the same view can be near each other
         near = _grouped(near, group, scenes)
         a, b = (part.reshape(-1, group * part.shape[1], part.shape[2]) for part in (a, b))
