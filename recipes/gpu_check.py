@@ -125,18 +125,23 @@ def main() -> int:
         size = 2 * chosen.optimiser.batch_size
         rate = size / timed(lambda step: batches[step], device, arguments.steps // 4)
         print(f"batches of {size} views, teachers included: {rate:.0f} views/s", flush=True)
-    for name in ("superpoint", "superpoint-small"):
-        for compiled in (False, True) if arguments.compile else (False,):
-            for chosen in with_size[1:2] if compiled else with_size:
-                used = replace(chosen, compile=compiled)
-                rate, loss = training_rate(name, batches, used, arguments.steps)
-                told = f"{name}{' compiled' if compiled else ''}, {chosen.optimiser.batch_size} pairs a step"
-                print(f"{told}: {rate:.0f} views/s, loss {loss:.3f}, at {time.monotonic() - begun:.0f} s", flush=True)
+
+    def tell(name: str, used: HeldSettings) -> None:
+        rate, loss = training_rate(name, batches, used, arguments.steps)
+        told = f"{name}{' compiled' if used.compile else ''}, {used.optimiser.batch_size} pairs a step"
+        print(f"{told}: {rate:.0f} views/s, loss {loss:.3f}, at {time.monotonic() - begun:.0f} s", flush=True)
+
+    names = ("superpoint", "superpoint-small")
+    for name in names:
+        for chosen in with_size:
+            tell(name, chosen)
     network = loaded(load_weights(find_weights("superpoint-vo"))).to(device, memory_format=torch.channels_last)
     images = torch.rand(16, 1, 480, 640, device=device)
     with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16):
         rate = 16 / timed(lambda _: network(images), device, 1 if arguments.tiny else 20)
-    print(f"inference, 640x480, superpoint-vo: {rate:.0f} images/s; all after {time.monotonic() - begun:.0f} s")
+    print(f"inference, 640x480, superpoint-vo: {rate:.0f} images/s; at {time.monotonic() - begun:.0f} s", flush=True)
+    for name in names if arguments.compile else ():  # last, as it takes longest
+        tell(name, replace(with_size[-1] if len(with_size) < 2 else with_size[1], compile=True))
     return 0 if good else 1
 
 
