@@ -83,8 +83,9 @@ def collect(jobs: list[dict[str, Any]], arguments: argparse.Namespace) -> list[s
     for job in jobs:
         folder = arguments.work / job["name"]
         weights, table = folder / WEIGHTS, folder / "metrics.jsonl"
-        if weights.is_file():
-            with files.written_atomically(arguments.output / f"{job['name']}.safetensors") as temporary:
+        copy = arguments.output / f"{job['name']}.safetensors"
+        if weights.is_file() and (not copy.exists() or copy.stat().st_mtime < weights.stat().st_mtime):
+            with files.written_atomically(copy) as temporary:
                 temporary.write_bytes(weights.read_bytes())
         rows = [json.loads(line) for line in table.read_text().splitlines()] if table.is_file() else []
         metrics[job["name"]] = rows
