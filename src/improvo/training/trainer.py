@@ -109,6 +109,7 @@ class Trainer:
             distributed.init_process_group("nccl" if self.device.type == "cuda" else "gloo")
         self.step = 0
         self.seconds = 0.0  # of training, over all runs
+        self._warm = False
         self._recent: deque[float] = deque(maxlen=9)  # seconds of a step, in the last rows of metrics
 
     def resume(self) -> bool:
@@ -202,6 +203,9 @@ class Trainer:
 
     def _plan(self, step_seconds: float) -> None:
         """Choose the number of steps anew from the time that is left; a fall of the rate that has begun is kept."""
+        if not self._warm:  # the first steps take as long as the device needs to get ready
+            self._warm = True
+            return
         self._recent.append(step_seconds)
         if not self.allowed or self.step > self.settings.steps - self._decay_steps:
             return
