@@ -67,8 +67,7 @@ def info_nce_loss(
     """
     negative = valid if negative is None else negative
     # not by matrix products, which may run in low precision
-    far = [torch.cdist(p, p, compute_mode="donot_use_mm_for_euclid_dist") for p in (points_a, points_b)]
-    near = (far[0] < masked_pixels) | (far[1] < masked_pixels)
+    near = _near(points_a, masked_pixels) | _near(points_b, masked_pixels)
     if group > 1:  # large pairs, in which only points of the same view can be near each other
         near = _grouped(near, group, scenes)
         a, b = (part.reshape(-1, group * part.shape[1], part.shape[2]) for part in (a, b))
@@ -146,3 +145,9 @@ def stability_loss(logits: Tensor, stability: Tensor, stable_per_unstable: float
     errors = functional.cross_entropy(logits.transpose(1, 2), stability, ignore_index=IGNORED, reduction="none")
     stable, unstable = ((errors * (stability == code)).sum() for code in (1, 0))
     return 0.5 * (stable + stable_per_unstable * unstable) / (stability == 1).sum().clamp(min=1)
+
+
+def _near(points: Tensor, radius: float) -> Tensor:
+    """(B, N, N) whether two points (B, N, 2) of a view are nearer than a radius; not by `cdist`, slow on a GPU."""
+    x, y = points[..., 0], points[..., 1]
+    return (x[:, :, None] - x[:, None]) ** 2 + (y[:, :, None] - y[:, None]) ** 2 < radius**2
