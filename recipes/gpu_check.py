@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from torch.nn import functional
 
-from improvo.frontend.live_channels import without_dead_channels
+from improvo.frontend.channel_pruning import without_dead_channels
 from improvo.frontend.superpoint import heat_map
 from improvo.frontend.weights import find_weights, load_weights
 from improvo.training.device_pairs import DevicePairs

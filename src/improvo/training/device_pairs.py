@@ -11,6 +11,7 @@ from torch import Tensor
 
 from improvo.errors import InputError
 from improvo.frontend.architecture import CELL
+from improvo.training.distributed import Share
 from improvo.training.labels import DUSTBIN
 from improvo.training.photometric_batch import augment_batch
 from improvo.training.picture_store import DepthStore, PictureStore, on_device
@@ -18,7 +19,6 @@ from improvo.training.pictures import Pictures
 from improvo.training.posed import PosedSequence, overlapping_pairs
 from improvo.training.random_views import random_views
 from improvo.training.settings import HeldSettings
-from improvo.training.share import Share
 from improvo.training.views import inside, warp_points
 from improvo.types import Float64, Int64
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from improvo.errors import InputError
-from improvo.frontend.live_channels import without_dead_channels
+from improvo.frontend.channel_pruning import without_dead_channels
 from improvo.frontend.superpoint import SuperPoint
 from improvo.frontend.weights import DataSource, Weights, load_weights
 from improvo.training.device_pairs import DevicePairs, Teacher
