@@ -7,10 +7,11 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from improvo.errors import MissingExtraError
+from improvo.errors import ConfigError, MissingExtraError
 
 if TYPE_CHECKING:
-    from improvo.evaluation.sources import FeatureSource, LoadedFrontend
+    from improvo.evaluation.sources import FeatureSource, LoadedFrontend, Recorded
+    from improvo.sequences.base import SequenceSettings
 
 DEFAULT_FRONTENDS = ["sift", "orb", "akaze"]
 
@@ -39,6 +40,33 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=argparse.SUPPRESS, help="of all random choices (default: 0)")
     parser.add_argument("--workers", type=int, default=cores, metavar="N", help="processes")
     parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="folder for the results")
+
+
+def add_truth_argument(parser: argparse.ArgumentParser) -> None:
+    """Which true poses replace those of the sequences."""
+    parser.add_argument(
+        "--truth",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="true poses instead of the sequence's own: a file of `improvo truth`, a TUM trajectory or the folder of a "
+        "COLMAP model, whose camera is used too; one for each SEQUENCE, in their order",
+    )
+
+
+def recorded_sequences(arguments: argparse.Namespace, settings: SequenceSettings) -> list[Recorded]:
+    """The sequences of the command line, each with its `--truth`.
+
+    Raises:
+        ConfigError: another number of `--truth` than of sequences.
+    """
+    from improvo.evaluation.sources import Recorded
+
+    paths, truths = arguments.sequences, arguments.truth
+    if truths and len(truths) != len(paths):
+        raise ConfigError(f"--truth: {len(truths)} given for {len(paths)} sequences; give one for each, or none")
+    chosen: list[str | None] = truths or [None] * len(paths)
+    return [Recorded(str(path), settings, truth) for path, truth in zip(paths, chosen, strict=True)]
 
 
 def loaded_frontends(

@@ -9,10 +9,11 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments
+from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments, add_truth_argument
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
 from improvo.errors import ImprovoError, InputError
 from improvo.evaluation.settings import ESTIMATORS, SAMPLINGS, PoseCommandSettings, PoseSettings
@@ -37,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `improvo evaluate pose`."""
     defaults, absent = PoseSettings(), argparse.SUPPRESS
     parser.add_argument("sequences", nargs="*", type=Path, metavar="SEQUENCE", help="with depth and true poses")
+    add_truth_argument(parser)
     add_frontend_arguments(parser, defaults.max_keypoints)
     parser.add_argument(
         "--features",
@@ -146,10 +148,10 @@ def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _settings(arguments: argparse.Namespace) -> tuple[PoseSettings, list[Recorded]]:
-    from improvo.evaluation.sources import Recorded
+    from improvo.cli.evaluate_options import recorded_sequences
 
     settings = settings_from(PoseCommandSettings, arguments, _FLAGS)
-    return settings.pose, [Recorded(str(path), settings.sequence) for path in arguments.sequences]
+    return settings.pose, recorded_sequences(arguments, settings.sequence)
 
 
 def _request(settings: PoseSettings, sources: list[Recorded], frontends: list[FeatureSource]) -> dict[str, Any]:
@@ -157,11 +159,19 @@ def _request(settings: PoseSettings, sources: list[Recorded], frontends: list[Fe
     from improvo.config import to_dict
     from improvo.evaluation.sources import sequence_fingerprint
 
+    truths = {source.open().name: _poses_digest(source) for source in sources if source.truth is not None}
     return {
         "settings": to_dict(settings),
         "sequences": [sequence_fingerprint(source, source.open()) for source in sources],
+        **({"truth": truths} if truths else {}),
         "frontends": [{"label": frontend.label, **frontend.fingerprint()} for frontend in frontends],
     }
+
+
+def _poses_digest(source: Recorded) -> int:
+    truth = source.open().ground_truth
+    assert truth is not None
+    return zlib.crc32(truth.world_from_cam.tobytes())
 
 
 def _write_text(results: dict[str, Any], output: Path) -> None:
