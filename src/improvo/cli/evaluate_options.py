@@ -16,6 +16,11 @@ if TYPE_CHECKING:
 DEFAULT_FRONTENDS = ["sift", "orb", "akaze"]
 
 
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def add_frontend_arguments(parser: argparse.ArgumentParser, max_keypoints: int) -> None:
     """Which frontends, and how many keypoints (the default is given for the help only)."""
     parser.add_argument(
@@ -36,9 +41,8 @@ def add_frontend_arguments(parser: argparse.ArgumentParser, max_keypoints: int) 
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     """Seed, processes, output folder."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     parser.add_argument("--seed", type=int, default=argparse.SUPPRESS, help="of all random choices (default: 0)")
-    parser.add_argument("--workers", type=int, default=cores, metavar="N", help="processes")
+    parser.add_argument("--workers", type=int, default=available_cores(), metavar="N", help="processes")
     parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="folder for the results")
 
 

@@ -52,7 +52,7 @@ class ReferencedSequence(Sequence):
         if reference.times is not None:
             truth = Trajectory(reference.times, reference.world_from_cam)
         else:
-            self._frames = _frames_of(reference, recording)
+            self._frames = frames_of(reference, recording)
             order = np.argsort(self._frames)
             self._frames, poses = self._frames[order], reference.world_from_cam[order]
             truth = Trajectory(recording.times[self._frames], poses)
@@ -105,7 +105,7 @@ class ReferencedSequence(Sequence):
         )
 
 
-def _frames_of(reference: ReferencePoses, recording: Recording) -> Int64:
+def frames_of(reference: ReferencePoses, recording: Recording) -> Int64:
     """(N,) which frame of the recording each pose belongs to.
 
     Raises:
