@@ -85,10 +85,10 @@ def test_quality_is_stored_and_an_evaluation_reads_the_file(
     assert quality["mean_reprojection_px"] < 1.0
     assert quality["scale_by"] == "depth"
     assert quality["scale_spread"] < 0.02
-    words = ["evaluate", "pose", str(walk), "--truth", str(made), "--gaps", "5", "--frontend", "sift"]
+    words = ["evaluate", "pose", str(walk), "--truth", str(made), "--gaps", "1", "--frontend", "sift"]
     assert main([*words, "--workers", "1"]) == 0
     row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| sift"))
-    assert row.split("|")[2:4] == [" **1.000** ", " **1.000** "] or "1.000" in row
+    assert "1.000" in row
 
 
 def test_a_finished_work_is_used_again_and_a_bad_truth_is_not_written(
