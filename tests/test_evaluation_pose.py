@@ -19,9 +19,9 @@ from improvo.evaluation.pose.estimators import with_opencv, with_poselib
 from improvo.evaluation.pose.pairs import draw_pairs, pairs_of_sequence
 from improvo.evaluation.pose.results import results
 from improvo.evaluation.pose.run import run_pose_protocol
+from improvo.evaluation.pose.tables import pose_tables
 from improvo.evaluation.settings import PoseSettings
 from improvo.evaluation.statistics import Bootstrap, accuracy_curve, area_shares, below
-from improvo.evaluation.tables import pose_tables
 from improvo.geometry.se3 import inverse, rigid, so3_exp
 from improvo.jobs.pool import Workers
 

@@ -78,6 +78,11 @@ def loaded_frontends(
 ) -> tuple[list[LoadedFrontend], list[dict[str, str]]]:
     """The frontends of the command line, each loaded once so that a wrong name fails before any work.
 
+    Args:
+        asked: `--frontend` of the command line.
+        max_keypoints: per image.
+        default: names where none is asked for; None are the usual ones.
+
     Returns:
         The frontends, and those of `all` that cannot run here, with the reason.
 
@@ -109,6 +114,11 @@ def loaded_frontends(
 
 def exported_features(asked: list[str], max_keypoints: int, one_sequence: bool) -> list[FeatureSource]:
     """The `--features` of the command line, each looked into once.
+
+    Args:
+        asked: `[LABEL=]PATH` of each.
+        max_keypoints: per image.
+        one_sequence: whether the run has a single sequence.
 
     Raises:
         InputError: nothing exported there.

@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int | None:
     """Evaluate, or print again; leaves pose.json, pose.md, curves and pairs.parquet in the output folder."""
-    from improvo.evaluation.tables import pose_tables
+    from improvo.evaluation.pose.tables import pose_tables
 
     if arguments.results is not None:
         results = read_results(arguments.results)
@@ -175,7 +175,7 @@ def _poses_digest(source: Recorded) -> int:
 
 
 def _write_text(results: dict[str, Any], output: Path) -> None:
-    from improvo.evaluation.tables import pose_tables
+    from improvo.evaluation.pose.tables import pose_tables
     from improvo.files import write_text
 
     write_text(output / "pose.md", pose_tables(results, sequences=len(results["sequences"]) > 1))

@@ -52,8 +52,8 @@ def run(arguments: argparse.Namespace) -> int | None:
     from improvo.evaluation.trajectory.tables import vo_tables
     from improvo.evaluation.vo.protocol import evaluate_vo
     from improvo.files import make_output_folder, write_json, write_text
-    from improvo.jobs.pool import Workers
     from improvo.geometry.trajectory_files import write_trajectory
+    from improvo.jobs.pool import Workers
 
     settings = settings_from(VoCommandSettings, arguments, _FLAGS)
     output: Path | None = arguments.output

@@ -67,7 +67,13 @@ def load_pycolmap() -> Any:
 
 
 def image_pairs(count: int, overlap: int, farthest: int) -> Int64:
-    """Pairs (K, 2) of images i < j to match: the next `overlap`, then 2^k images later up to `farthest`."""
+    """Pairs (K, 2) of images to match, each with later ones.
+
+    Args:
+        count: of images, in the order of time.
+        overlap: how many of the next images.
+        farthest: beyond them 2^k images later, up to this.
+    """
     steps = list(range(1, overlap + 1))
     steps += [step for power in range(20) if overlap < (step := 2**power) <= farthest]
     pairs = [(first, first + step) for step in steps for first in range(count - step)]
