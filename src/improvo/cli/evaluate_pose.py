@@ -31,6 +31,7 @@ _FLAGS = {
     "depth_sampling": "pose.depth_sampling",
     "max_keypoints": "pose.max_keypoints",
     "seed": "pose.seed",
+    "shuffles": "pose.shuffles",
 }
 
 
@@ -63,6 +64,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--depth-sampling", choices=SAMPLINGS, default=absent, help=f"(default: {defaults.depth_sampling})"
+    )
+    parser.add_argument(
+        "--shuffles",
+        type=int,
+        default=absent,
+        metavar="N",
+        help=f"mean over so many orders of each pair's matches, which takes noise away (default: {defaults.shuffles})",
     )
     parser.add_argument("--per-sequence", action="store_true", help="print the table of each sequence too")
     parser.add_argument("--from", dest="results", type=Path, metavar="POSE.JSON", help="print an earlier run again")

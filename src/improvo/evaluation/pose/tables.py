@@ -57,6 +57,8 @@ def _setup(results: dict[str, Any]) -> str:
         f"At most {settings['max_keypoints']} keypoints, mutual nearest neighbours",
         f"{settings['depth_sampling']} depth, seed {settings['seed']}; success is strictly below",
     ]
+    shuffles = settings.get("shuffles", 1)
+    rules += [f"mean over {shuffles} orders of each pair's matches"] if shuffles > 1 else []
     limits = f"{settings['max_rotation_deg']:g}° and {100 * settings['max_translation_m']:g} cm."
     return f"{', '.join(rules)} {limits}\n\n" + "\n".join(lines)
 
@@ -69,18 +71,21 @@ def _cell(rows: list[dict[str, Any]], frontend: str, estimator: str, gap: int, f
 
 
 def _table_1(results: dict[str, Any], rows: list[dict[str, Any]], estimator: str) -> str:
-    """The paper's Table 1, for one solver."""
+    """The paper's Table 1, for one solver, and the shares of right matches, which are less noisy."""
     settings, frontends = results["settings"], results["frontends"]
     gaps = settings["gaps"]
     pose = {entry["gap"]: entry for entry in results["gaps"]}
-    header = ["Frame difference", *map(str, gaps), *map(str, gaps)]
+    shares = _right_shares(results)
+    header = ["Frame difference", *(str(gap) for _ in range(2 + len(shares)) for gap in gaps)]
     average = ["Average relative pose", *(f"{pose[gap]['mean_rotation_deg']:.0f}°" for gap in gaps)]
     average += [f"{100 * pose[gap]['mean_translation_m']:.0f} cm" for gap in gaps]
+    average += [""] * (len(shares) * len(gaps))
     rotation = f"Rot. < {settings['max_rotation_deg']:g}°"
     translation = f"Transl. < {100 * settings['max_translation_m']:g} cm"
-    legend = ["", *([rotation] * len(gaps)), *([translation] * len(gaps))]
+    names = [rotation, translation, *(f"Right < {limit:g} px" for limit in shares.values())]
+    legend = ["", *(name for name in names for _ in gaps)]
     columns = []
-    for field in ("rotation_success", "translation_success"):
+    for field in ("rotation_success", "translation_success", *shares):
         for gap in gaps:
             values = [_cell(rows, frontend, estimator, gap, field) for frontend in frontends]
             columns.append(bold_best([decimals(value) for value in values], values))
@@ -88,10 +93,17 @@ def _table_1(results: dict[str, Any], rows: list[dict[str, Any]], estimator: str
     return markdown(header, [*shown, *columns_to_rows(frontends, columns)])
 
 
+def _right_shares(results: dict[str, Any]) -> dict[str, float]:
+    """Names of the shares of right matches and their limits in pixels; none in results of earlier versions."""
+    return {f"right_share_{limit:g}px": limit for limit in results["settings"].get("right_px", ())}
+
+
 def _intervals(results: dict[str, Any], estimator: str) -> str:
     gaps, frontends = results["settings"]["gaps"], results["frontends"]
     header, columns = [""], []
-    for field, name in (("rotation_success", "rot."), ("translation_success", "transl."), ("pose_success", "both")):
+    fields = {"rotation_success": "rot.", "translation_success": "transl.", "pose_success": "both"}
+    fields |= {field: f"< {limit:g} px" for field, limit in _right_shares(results).items()}
+    for field, name in fields.items():
         for gap in gaps:
             header.append(f"{name} {gap}")
             spans = [_cell(results["rows"], frontend, estimator, gap, f"{field}_interval") for frontend in frontends]
@@ -107,8 +119,11 @@ def _differences(results: dict[str, Any], estimator: str) -> str:
         "rotation_auc": "rot. area",
         "translation_auc": "transl. area",
         "precision": "precision",
+        **{field: f"right < {limit:g} px" for field, limit in _right_shares(results).items()},
         "inlier_share": "inliers / matches",
     }
+    if _right_shares(results):  # the same at max_error_px
+        del fields["precision"]
     chosen = [row for row in results["differences"] if row["estimator"] == estimator]
 
     def cell(row: dict[str, Any], field: str) -> str:
