@@ -67,5 +67,13 @@ class Bootstrap:
 
     def interval(self, values: NDArray[np.generic]) -> tuple[float, float]:
         """Interval of the mean of finite `values` (N,)."""
-        low, high = np.percentile(self._weights @ values.astype(np.float32), self._percentiles)
+        return self.percentiles(self.means(values))
+
+    def means(self, values: NDArray[np.generic]) -> Float64:
+        """Mean of finite `values` (N,) in every resample."""
+        return np.asarray(self._weights @ values.astype(np.float32))
+
+    def percentiles(self, means: Float64) -> tuple[float, float]:
+        """The interval that holds the chosen share of the resampled `means`."""
+        low, high = np.percentile(means, self._percentiles)
         return float(low), float(high)
