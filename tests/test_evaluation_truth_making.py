@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,11 +15,13 @@ from improvo.cli.main import main
 from improvo.errors import ConfigError, InputError
 from improvo.evaluation.truth.make import TruthQuality
 from improvo.evaluation.truth.metric_scale import scale_from_depth, scale_from_poses
+from improvo.evaluation.truth.motion_check import check_motion
 from improvo.evaluation.truth.reference import read_reference
 from improvo.evaluation.truth.settings import TruthSettings
 from improvo.evaluation.truth.structure_from_motion import ReconstructedImage, image_pairs
 from improvo.geometry.alignment import align_points
-from improvo.geometry.se3 import inverse, rigid, rotation_angle_deg, so3_exp
+from improvo.geometry.camera import Camera
+from improvo.geometry.se3 import inverse, rigid, rotation_angle_deg, so3_exp, transform
 from improvo.geometry.trajectory_files import write_trajectory
 from improvo.types import Float32, Float64, Trajectory
 
@@ -85,6 +88,8 @@ def test_quality_is_stored_and_an_evaluation_reads_the_file(
     assert quality["mean_reprojection_px"] < 1.0
     assert quality["scale_by"] == "depth"
     assert quality["scale_spread"] < 0.02
+    assert quality["motion"]["length_ratio"] == pytest.approx(1.0, abs=0.01)
+    assert quality["motion"]["rotation_deg"] < 0.2
     words = ["evaluate", "pose", str(walk), "--truth", str(made), "--gaps", "1", "--frontend", "sift"]
     assert main([*words, "--workers", "1"]) == 0
     row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| sift"))
@@ -124,8 +129,8 @@ def test_pairs_are_the_next_images_and_powers_of_two() -> None:
 def test_scale_by_depth_is_the_median_and_knows_its_spread() -> None:
     rng = np.random.default_rng(0)
     pixels = rng.uniform(5, 50, (40, 2))
-    image = ReconstructedImage("a", np.eye(4), pixels, np.full(40, 0.5))
-    few = ReconstructedImage("b", np.eye(4), pixels[:5], np.full(5, 0.5))
+    image = ReconstructedImage("a", np.eye(4), pixels, np.full(40, 0.5), np.arange(40))
+    few = ReconstructedImage("b", np.eye(4), pixels[:5], np.full(5, 0.5), np.arange(5))
     maps: list[Float32 | None] = [np.full((60, 60), depth, np.float32) for depth in (1.0, 1.01, 0.99, 1.0)]
     scale = scale_from_depth((image, image, image, few), lambda row: maps[row], min_depths=20)
     assert scale is not None
@@ -150,11 +155,43 @@ def test_scale_by_poses_survives_a_turned_world_and_missing_poses() -> None:
         scale_from_poses(poses[:2], metric[:2])
 
 
+def seen_from(pose: Float64, points: Float64, camera: Camera) -> ReconstructedImage:
+    """What a perfect reconstruction knows of an image, with the depth of its points."""
+    local = transform(inverse(pose), points)
+    rays = camera.distort(local[:, :2] / local[:, 2:])
+    pixels = rays * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    return ReconstructedImage("", inverse(pose), pixels, local[:, 2], np.arange(len(points)))
+
+
+@pytest.mark.parametrize("distortion", [(), (-0.1, 0.02, 0.001, -0.002)])
+def test_motions_by_depth_tell_poses_that_are_too_long_sideways(distortion: tuple[float, ...]) -> None:
+    camera = Camera(200, 200, 220.0, 220.0, 100.0, 95.0, distortion)
+    xy = np.random.default_rng(0).uniform(-0.5, 0.5, (300, 2))
+    points = np.column_stack([xy, np.full(300, 2.0)])  # a wall, and a camera that moves along it
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    poses[:, 0, 3] = np.linspace(-0.3, 0.3, 20)
+    depth = np.full((200, 200), 2.0, np.float32)
+    exact = tuple(seen_from(pose, points, camera) for pose in poses)
+    check = check_motion(exact, camera, lambda row: depth, 1.0)
+    assert check is not None
+    assert check.length_ratio == pytest.approx(1.0, abs=1e-3)
+    longer = poses.copy()
+    longer[:, 0, 3] *= 1.1
+    wrong = tuple(replace(image, cam_from_world=inverse(pose)) for image, pose in zip(exact, longer, strict=True))
+    check = check_motion(wrong, camera, lambda row: depth, 1.0)
+    assert check is not None
+    assert check.length_ratio == pytest.approx(1 / 1.1, abs=1e-3)
+    quality = TruthQuality(20, 20, 300, 8.0, 0.5, "depth", 20, 0.0, 0.0, motion=check)
+    assert "motions by depth are 0.909 times as long" in quality.faults(TruthSettings())[0]
+    assert check_motion(exact, camera, lambda row: None, 1.0) is None
+
+
 def test_limits_name_what_is_wrong() -> None:
     good = TruthQuality(100, 95, 5000, 8.0, 0.6, "depth", 90, 0.01, 0.01)
     assert good.faults(TruthSettings()) == []
     assert "95 of 100 frames registered" in good.text()
-    bad = TruthQuality(100, 50, 5000, 8.0, float("nan"), "depth", 90, 0.2, 0.2)
-    assert len(bad.faults(TruthSettings())) == 4
+    bad = TruthQuality(100, 50, 5000, 8.0, float("nan"), "depth", 90, 0.2, 0.2, aspect_change=-0.03)
+    assert len(bad.faults(TruthSettings())) == 5
+    assert "fy / fx differs by -3.0 %" in bad.faults(TruthSettings())[-1]
     with pytest.raises(ConfigError):
         TruthSettings(min_registered=0)

@@ -11,6 +11,7 @@ import numpy as np
 from improvo.config import to_dict
 from improvo.errors import ConfigError, InputError
 from improvo.evaluation.truth.metric_scale import MetricScale, scale_from_depth, scale_from_poses
+from improvo.evaluation.truth.motion_check import MotionCheck, check_motion
 from improvo.evaluation.truth.reference import ReferencePoses, read_reference, write_reference
 from improvo.evaluation.truth.referenced import ReferencedSequence, frames_of
 from improvo.evaluation.truth.settings import TruthSettings
@@ -21,6 +22,7 @@ from improvo.evaluation.truth.structure_from_motion import (
     reconstruct,
 )
 from improvo.files import make_output_folder, write_json
+from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import inverse
 from improvo.sequences import Sequence
 from improvo.sequences.base import UnreadableFrameError
@@ -43,6 +45,8 @@ class TruthQuality:
     scale_images: int
     scale_spread: float  # relative, between images
     disagreement: float  # with depth or trajectory, relative
+    aspect_change: float = 0.0  # of fy / fx against the given camera; a lens has none, an uncertain camera has
+    motion: MotionCheck | None = None  # against motions by depth; None where the scale is not from depth
 
     def faults(self, settings: TruthSettings) -> list[str]:
         """Why it must not be written; empty where it may."""
@@ -56,6 +60,13 @@ class TruthQuality:
             found.append(f"scale differs by {100 * self.scale_spread:.1f} % between frames (max_scale_spread)")
         if not self.disagreement <= settings.max_disagreement:
             found.append(f"{100 * self.disagreement:.1f} % off {self.scale_by} (max_disagreement)")
+        if self.motion is not None and not abs(self.motion.length_ratio - 1) <= settings.max_motion_error:
+            found.append(f"motions by depth are {self.motion.length_ratio:.3f} times as long (max_motion_error)")
+        if not abs(self.aspect_change) <= settings.max_aspect_change:
+            found.append(
+                f"fy / fx differs by {100 * self.aspect_change:+.1f} % from the given camera's (max_aspect_change), so "
+                "the camera is uncertain: take more frames that turn, or --calibrate none"
+            )
         return found
 
     def text(self) -> str:
@@ -65,6 +76,7 @@ class TruthQuality:
             f"{self.mean_track_length:.1f} images each, mean error {self.mean_reprojection_px:.2f} px; scale by "
             f"{self.scale_by} of {self.scale_images} frames, spread {100 * self.scale_spread:.1f} %, "
             f"off by {100 * self.disagreement:.1f} %"
+            + (f"; motions by depth {self.motion.length_ratio:.3f} times as long" if self.motion else "")
         )
 
 
@@ -106,7 +118,7 @@ def make_truth(
     names = tuple(image.name for image in found.images)
     world_from_cam = inverse(np.stack([image.cam_from_world for image in found.images]))
     frames = frames_of(ReferencePoses(str(model or sequence.path), world_from_cam, names=names), sequence.recording)
-    scale = _scale(found, sequence, frames, world_from_cam, metric, settings)
+    scale, motion = _scale(found, sequence, frames, world_from_cam, metric, settings)
     quality = TruthQuality(
         frames=len(sequence),
         registered=len(frames),
@@ -117,6 +129,8 @@ def make_truth(
         scale_images=scale.images,
         scale_spread=scale.spread,
         disagreement=scale.disagreement,
+        aspect_change=_aspect(found.camera) / _aspect(sequence.raw_camera) - 1.0,
+        motion=motion,
     )
     faults = quality.faults(settings)
     if faults:
@@ -127,6 +141,10 @@ def make_truth(
     write_reference(output, found.camera, frames[order], poses[order], comments=(f"improvo truth: {quality.text()}",))
     write_json(output.with_suffix(".json"), {"quality": to_dict(quality), "settings": to_dict(settings)})
     return quality
+
+
+def _aspect(camera: Camera) -> float:
+    return camera.fy / camera.fx
 
 
 def _working_folder(output: Path, sequence: Sequence, settings: TruthSettings) -> Path:
@@ -153,13 +171,14 @@ def _scale(
     world_from_cam: Float64,
     metric: ReferencePoses | None,
     settings: TruthSettings,
-) -> MetricScale:
+) -> tuple[MetricScale, MotionCheck | None]:
+    """The scale, and where it is by depth, the check of motions by depth."""
     if metric is not None:
         whole = replace(sequence.settings, start=0, end=None, stride=1, max_frames=None)
         truth = ReferencedSequence(sequence.recording, whole, replace(metric, calibration=None)).ground_truth
         assert truth is not None
         try:
-            return scale_from_poses(world_from_cam, truth.world_from_cam[frames])
+            return scale_from_poses(world_from_cam, truth.world_from_cam[frames]), None
         except InputError as error:
             raise InputError(f"{metric.source}: gives no scale ({error})") from None
 
@@ -172,4 +191,4 @@ def _scale(
     scale = scale_from_depth(found.images, depth, settings.min_depths)
     if scale is None:
         raise InputError(f"{sequence.path}: has no depth that gives the scale; give poses in metres with --scale-from")
-    return scale
+    return scale, check_motion(found.images, found.camera, depth, scale.scale, settings.seed)

@@ -24,13 +24,21 @@ class TruthSettings:
     max_reprojection_px: float = 1.5  # mean error of the points; above it nothing is written
     max_disagreement: float = 0.05  # of the scale's source, relative; above it nothing is written
     max_scale_spread: float = 0.05  # between images, relative; above it nothing is written
+    max_aspect_change: float = 0.02  # of fy / fx against the given camera; above it nothing is written
+    max_motion_error: float = 0.03  # relative length of motions against those by depth; above it nothing is written
 
     def __post_init__(self) -> None:
         if self.max_features < 100 or self.overlap < 1 or self.farthest < 1 or self.min_depths < 1:
             raise ConfigError("truth: max_features must be 100 or more, overlap, farthest and min_depths 1 or more")
         if self.calibrate not in CALIBRATE:
             raise ConfigError(f"truth: calibrate `{self.calibrate}` is unknown; choose one of {', '.join(CALIBRATE)}")
-        limits = (self.max_reprojection_px, self.max_disagreement, self.max_scale_spread)
+        limits = (
+            self.max_reprojection_px,
+            self.max_disagreement,
+            self.max_scale_spread,
+            self.max_motion_error,
+            self.max_aspect_change,
+        )
         if not 0 < self.min_registered <= 1 or min(limits) <= 0:
             raise ConfigError("truth: min_registered must be above 0 and at most 1, the other limits positive")
 

@@ -39,6 +39,7 @@ class ReconstructedImage:
     cam_from_world: Float64  # (4, 4), unit of the reconstruction
     pixels: Float64  # (M, 2) the centre of the top-left pixel at (0, 0), distorted
     depth: Float64  # (M,) Z of the points in this camera
+    points: Int64  # (M,) their numbers
 
 
 @dataclass(frozen=True)
@@ -156,12 +157,11 @@ def read_reconstruction(folder: Path) -> Reconstruction:
 
 def _image(image: Any, good: dict[int, Float64]) -> ReconstructedImage:
     cam_from_world = np.vstack([np.asarray(image.cam_from_world().matrix()), [0.0, 0.0, 0.0, 1.0]])
-    seen = [(point.xy, good[point.point3D_id]) for point in image.points2D if point.point3D_id in good]
-    pixels = np.array([pixel for pixel, _ in seen], np.float64).reshape(-1, 2) - 0.5
-    xyz = np.array([point for _, point in seen], np.float64).reshape(-1, 3)
-    return ReconstructedImage(
-        str(image.name), cam_from_world, pixels, xyz @ cam_from_world[2, :3] + cam_from_world[2, 3]
-    )
+    seen = {point.point3D_id: point.xy for point in image.points2D if point.point3D_id in good}
+    pixels = np.array(list(seen.values()), np.float64).reshape(-1, 2) - 0.5
+    xyz = np.array([good[number] for number in seen], np.float64).reshape(-1, 3)
+    depth = xyz @ cam_from_world[2, :3] + cam_from_world[2, 3]
+    return ReconstructedImage(str(image.name), cam_from_world, pixels, depth, np.array(list(seen), np.int64))
 
 
 def _write_images(sequence: FrameSequence, folder: Path, progress: Progress) -> list[str]:
