@@ -18,7 +18,7 @@ from improvo.odometry.run_settings import RunSettings
 
 if TYPE_CHECKING:
     from improvo.odometry.run import RunSummary
-    from improvo.odometry.view import View
+    from improvo.odometry.visual_odometry import TrackedFrame
     from improvo.odometry.visualizer import Visualizer
     from improvo.sequences import Sequence
 
@@ -94,8 +94,8 @@ def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: Visu
     compile_odometry(lambda words: print(words, file=sys.stderr))
     with tqdm(total=sequence.length, unit="frame", desc="run", smoothing=0.1, delay=0.5) as bar:
 
-        def progress(view: View) -> None:
-            bar.set_postfix_str("no pose yet" if view.cam_from_world is None else "", refresh=False)
+        def progress(frame: TrackedFrame) -> None:
+            bar.set_postfix_str("no pose yet" if frame.cam_from_world is None else "", refresh=False)
             bar.update()
 
         return run_odometry(sequence, folder, settings, visualizer=viewer, progress=progress)
