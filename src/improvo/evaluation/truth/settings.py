@@ -32,14 +32,8 @@ class TruthSettings:
             raise ConfigError("truth: max_features must be 100 or more, overlap, farthest and min_depths 1 or more")
         if self.calibrate not in CALIBRATE:
             raise ConfigError(f"truth: calibrate `{self.calibrate}` is unknown; choose one of {', '.join(CALIBRATE)}")
-        limits = (
-            self.max_reprojection_px,
-            self.max_disagreement,
-            self.max_scale_spread,
-            self.max_motion_error,
-            self.max_aspect_change,
-        )
-        if not 0 < self.min_registered <= 1 or min(limits) <= 0:
+        relative = (self.max_disagreement, self.max_scale_spread, self.max_motion_error, self.max_aspect_change)
+        if not 0 < self.min_registered <= 1 or min(self.max_reprojection_px, *relative) <= 0:
             raise ConfigError("truth: min_registered must be above 0 and at most 1, the other limits positive")
 
 
