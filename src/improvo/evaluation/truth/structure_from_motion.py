@@ -104,7 +104,7 @@ def reconstruct(
             f"{sequence.path}: its {start.distortion_model} camera has no place in a truth file, which holds "
             "k1 k2 p1 p2; undistort the images first"
         )
-    if not (folder / "model" / "images.bin").is_file():
+    if not (folder / "model").is_dir():
         names = _write_images(sequence, folder / "images", progress)
         _extract(pycolmap, folder, names, start, settings, threads, progress)
         _match(pycolmap, folder, names, settings, threads, progress)
@@ -113,8 +113,10 @@ def reconstruct(
             raise InputError(f"{sequence.path}: structure from motion found no model; the camera moves too little")
         if settings.calibrate == "full":
             _refine(pycolmap, best, threads)
-        (folder / "model").mkdir(exist_ok=True)
-        best.write(str(folder / "model"))
+        unfinished = folder / "model.partial"  # a model appears complete or not at all
+        unfinished.mkdir(exist_ok=True)
+        best.write(str(unfinished))
+        unfinished.rename(folder / "model")
     return read_reconstruction(folder / "model")
 
 
