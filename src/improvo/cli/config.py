@@ -15,6 +15,7 @@ SETTINGS = {  # command -> its settings
     "evaluate-pose": "improvo.evaluation.settings:PoseCommandSettings",
     "evaluate-trajectory": "improvo.evaluation.settings:TrajectoryCommandSettings",
     "evaluate-vo": "improvo.evaluation.settings:VoCommandSettings",
+    "truth": "improvo.evaluation.truth.settings:TruthCommandSettings",
     "evaluate-homography": "improvo.evaluation.settings:HomographyCommandSettings",
     "train-shapes": "improvo.training.settings:ShapesSettings",
     "train-homographies": "improvo.training.settings:HomographiesSettings",
