@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from improvo.types import Float32, Float64
+from improvo.types import Float32, Float64, UInt8
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,7 @@ class DepthMap:
     depth: Float32  # (h, w) Z in the camera, 0 where unknown
     confidence: Float32  # (h, w) 0 to 1, 0 where unknown
     K: Float64  # (3, 3) pixels of the map
+    agreeing: UInt8 | None = None  # (h, w) other frames with the same depth there; None before frames were compared
 
     @property
     def known(self) -> float:

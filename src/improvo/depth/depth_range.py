@@ -13,9 +13,9 @@ from improvo.depth.settings import DepthSettings
 from improvo.geometry import se3
 from improvo.types import Float32, Float64, Int64
 
-_NEAREST, _FARTHEST = 0.01, 0.99  # quantiles of the depths
-_NEARER, _FARTHER = 0.75, 1.5  # the range goes beyond them by these factors
-_LEAST_DEPTHS = 10
+NEAREST, FARTHEST = 0.01, 0.99  # quantiles of the depths
+LEAST_DEPTHS = 10
+_NEARER, _FARTHER = 0.75, 1.5  # the range goes beyond the quantiles by these factors
 _BASELINES = 6  # tried by the search, each about half the one before
 _SEARCHED = (2.0, 60.0)  # depths of the search, in baselines
 _LEAST_KNOWN = 0.01  # share of the pixels that the search must know
@@ -27,9 +27,14 @@ def range_of_depths(depths: Float64 | Float32) -> tuple[float, float, float] | N
     The range goes beyond the 1 % and 99 % quantiles by a quarter and by a half. None from fewer than ten depths.
     """
     finite = depths[np.isfinite(depths) & (depths > 0)]
-    if len(finite) < _LEAST_DEPTHS:
+    if len(finite) < LEAST_DEPTHS:
         return None
-    near, median, far = np.quantile(finite, (_NEAREST, 0.5, _FARTHEST)).tolist()
+    near, median, far = np.quantile(finite, (NEAREST, 0.5, FARTHEST)).tolist()
+    return widened(near, median, far)
+
+
+def widened(near: float, median: float, far: float) -> tuple[float, float, float]:
+    """The range of a sweep from the quantiles of depths."""
     return _NEARER * near, median, _FARTHER * far
 
 

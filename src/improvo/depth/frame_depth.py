@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from improvo.depth.depth_map import DepthMap, half_intrinsics
 from improvo.depth.depth_range import search_depth_range
@@ -38,7 +38,6 @@ def sweep_depth(
     Returns:
         A map that is empty (0 everywhere) where the camera moved too little, or where nothing can be matched.
     """
-    settings = settings or DepthSettings()
     prepared: dict[int, PreparedImage] = {}
 
     def prepare(row: int) -> PreparedImage:
@@ -47,17 +46,29 @@ def sweep_depth(
         return prepared[row]
 
     half = half_intrinsics(K)
+    return frame_depth(prepare, cam_from_world, half, frame, candidates, depth_range, settings or DepthSettings())[0]
+
+
+def frame_depth(
+    prepare: Callable[[int], PreparedImage],
+    cam_from_world: Float64,
+    K: Float64,
+    frame: int,
+    candidates: Sequence[int],
+    depth_range: tuple[float, float, float] | None,
+    settings: DepthSettings,
+) -> tuple[DepthMap, list[int]]:
+    """As `sweep_depth`, over prepared images and their `K`; also returns the neighbours that were chosen."""
     reference = prepare(frame)
     width, height = reference.size
     if depth_range is None:
-        depth_range = search_depth_range(prepare, cam_from_world, half, frame, candidates, settings)
+        depth_range = search_depth_range(prepare, cam_from_world, K, frame, candidates, settings)
     if depth_range is None:
-        return DepthMap.empty(height, width, half)
+        return DepthMap.empty(height, width, K), []
     near, median, far = depth_range
-    rows = choose_neighbours(cam_from_world, half, (width, height), frame, candidates, median, settings.neighbours)
+    rows = choose_neighbours(cam_from_world, K, (width, height), frame, candidates, median, settings.neighbours)
     if not rows:
-        return DepthMap.empty(height, width, half)
+        return DepthMap.empty(height, width, K), []
     other_from_frame = cam_from_world[rows] @ se3.inverse(cam_from_world[frame])
-    return sweep_prepared(
-        reference, [prepare(row) for row in rows], other_from_frame, half, (near, far), settings.sweep
-    )
+    others = [prepare(row) for row in rows]
+    return sweep_prepared(reference, others, other_from_frame, K, (near, far), settings.sweep), rows

@@ -14,7 +14,7 @@ from improvo.depth.depth_map import DepthMap
 from improvo.depth.prepared_image import PreparedImage
 from improvo.depth.settings import SweepSettings
 from improvo.depth.sweep_kernels import LEVELS, WINDOW, pick, sweep
-from improvo.types import Float32, Float64
+from improvo.types import Float64
 
 
 def sweep_prepared(
@@ -36,33 +36,29 @@ def sweep_prepared(
         settings: of the sweep.
     """
     width, height = reference.size
-    near, far = near_far
-    inverse_depths = np.linspace(1 / far, 1 / near, settings.planes)
-    volume = sweep_volume(reference, others, other_from_frame, K, inverse_depths)
-    result = DepthMap.empty(height, width, K)
-    weakest = np.float32(1 / (WINDOW * WINDOW * LEVELS * settings.min_texture))
-    pick(
-        volume, reference.inverse_spread, inverse_depths, weakest, np.float32(settings.min_score),
-        np.float32(settings.max_second), result.depth, result.confidence,
-    )  # fmt: skip
-    return result
-
-
-def sweep_volume(
-    reference: PreparedImage,
-    others: Sequence[PreparedImage],
-    other_from_frame: Float64,
-    K: Float64,
-    inverse_depths: Float64,
-) -> Float32:
-    """(D, h, w) mean ZNCC over the better half of the neighbours, -1 where unknown."""
-    width, height = reference.size
-    volume = np.full((len(inverse_depths), height, width), -1, np.float32)
-    A = K @ other_from_frame[:, :3, :3] @ np.linalg.inv(K)
-    b = other_from_frame[:, :3, 3] @ K.T
-    packed = np.stack([other.packed for other in others])
+    inverse_depths = np.linspace(1 / near_far[1], 1 / near_far[0], settings.planes)
+    sums, inverse_spread = reference.window_sums()
+    volume = np.full((settings.planes, height, width), -1, np.float32)
     sweep(
-        reference.values, reference.sums, reference.inverse_spread, packed, A, b, inverse_depths,
-        (len(others) + 1) // 2, volume,
-    )  # fmt: skip
-    return volume
+        reference.values(),
+        sums,
+        inverse_spread,
+        np.stack([other.packed for other in others]),
+        K @ other_from_frame[:, :3, :3] @ np.linalg.inv(K),
+        other_from_frame[:, :3, 3] @ K.T,
+        inverse_depths,
+        (len(others) + 1) // 2,
+        volume,
+    )
+    found = DepthMap.empty(height, width, K)
+    pick(
+        volume,
+        inverse_spread,
+        inverse_depths,
+        np.float32(1 / (WINDOW * WINDOW * LEVELS * settings.min_texture)),
+        np.float32(settings.min_score),
+        np.float32(settings.max_second),
+        found.depth,
+        found.confidence,
+    )
+    return found

@@ -53,8 +53,49 @@ class SweepSettings:
 
 
 @dataclass(frozen=True)
+class AgreementSettings:
+    """When several frames agree on a depth."""
+
+    least: int = 2  # other frames that have the same depth
+    tolerance: float = 0.05  # relative difference of two depths that agree
+    max_contradicting: float = 0.5  # frames that see through the point, as a share of those that agree
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.least <= 32:
+            raise ConfigError(f"agreement.least={self.least}: is 0 to 32 frames")
+        if not 0 < self.tolerance < 1:
+            raise ConfigError(f"agreement.tolerance={self.tolerance}: is a relative difference between 0 and 1")
+        if not self.max_contradicting >= 0:
+            raise ConfigError(f"agreement.max_contradicting={self.max_contradicting}: is 0 or more")
+
+
+@dataclass(frozen=True)
+class CloudSettings:
+    """The fused point cloud."""
+
+    voxel: float = 0.006  # side of the cell that gets one point; the first median depth is 1
+    least: int = 2  # other frames that agree on a point
+    least_points: int = 2  # pixels, of any frames, that fall into a cell before it gets its point
+
+    def __post_init__(self) -> None:
+        if not self.voxel > 0:
+            raise ConfigError(f"cloud.voxel={self.voxel}: is a length over 0; the first median depth is 1")
+        if self.least < 0 or self.least_points < 1:
+            raise ConfigError(
+                f"cloud.least={self.least}, least_points={self.least_points}: at least 0 frames and 1 pixel"
+            )
+
+
+@dataclass(frozen=True)
 class DepthSettings:
     """All settings of dense depth."""
 
+    reach: int = 60  # frames before and after a frame that may be its neighbours
     neighbours: NeighbourSettings = field(default_factory=NeighbourSettings)
     sweep: SweepSettings = field(default_factory=SweepSettings)
+    agreement: AgreementSettings = field(default_factory=AgreementSettings)
+    cloud: CloudSettings = field(default_factory=CloudSettings)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.reach <= 1000:
+            raise ConfigError(f"depth.reach={self.reach}: is 1 to 1000 frames")
