@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from improvo.backend.compiled import compiled
+from improvo.compiled import compiled
 
 
 @compiled
@@ -45,7 +45,7 @@ def compare(
                     continue
                 qx = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * z + pose[0, 3]
                 qy = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * z + pose[1, 3]
-                u, v = int(math.floor(fx * qx / qz + cx + 0.5)), int(math.floor(fy * qy / qz + cy + 0.5))
+                u, v = math.floor(fx * qx / qz + cx + 0.5), math.floor(fy * qy / qz + cy + 0.5)
                 if u < 0 or u >= width or v < 0 or v >= height:
                     continue
                 there = float(others[n, v, u])

@@ -18,10 +18,10 @@ from improvo.depth.sparse_depths import ranges_of_run
 from improvo.errors import InputError
 from improvo.files import write_json
 from improvo.geometry import se3
-from improvo.labeling.tables import POINTS_FILE, TRACKS_FILE
 from improvo.odometry.run import RunSummary
 from improvo.sequences import Sequence
 from improvo.sequences.images import grey
+from improvo.stability.tables import POINTS_FILE, TRACKS_FILE
 from improvo.types import Float64, UInt8
 
 CLOUD_FILE = "dense.ply"

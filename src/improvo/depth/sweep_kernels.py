@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from improvo.backend.compiled import compiled
+from improvo.compiled import compiled
 
 RADIUS = 3  # of the window: 7 x 7
 WINDOW = 2 * RADIUS + 1

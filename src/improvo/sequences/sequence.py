@@ -143,7 +143,8 @@ class Sequence:
             raw = self._raw_image(index)
         except UnreadableFrameError as error:
             raise InputError(f"{self.recording.source(index)}: {error}; leave this frame out") from None
-        return self._rectifier.image(cv2.cvtColor(raw, cv2.COLOR_GRAY2BGR) if raw.ndim == 2 else raw[..., :3])
+        colourless = raw.ndim == 2 or raw.shape[2] == 1
+        return self._rectifier.image(cv2.cvtColor(grey(raw), cv2.COLOR_GRAY2BGR) if colourless else raw[..., :3])
 
     def _frame(self, index: int) -> Frame | None:
         source = self.recording.source(index)
