@@ -11,7 +11,7 @@ SETTINGS = {  # command -> its settings
     "simulate": "improvo.simulation.settings:SimulationSettings",
     "improve": "improvo.improvement.settings:ImproveSettings",
     "label": "improvo.odometry.run_settings:LabelRunSettings",
-    "run": "improvo.odometry.run_settings:RunSettings",
+    "run": "improvo.depth.run_settings:DenseRunSettings",
     "evaluate-pose": "improvo.evaluation.settings:PoseCommandSettings",
     "evaluate-trajectory": "improvo.evaluation.settings:TrajectoryCommandSettings",
     "evaluate-vo": "improvo.evaluation.settings:VoCommandSettings",

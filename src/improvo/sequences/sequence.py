@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from improvo.errors import InputError
@@ -130,6 +131,20 @@ class Sequence:
         if depth is None or (depth.shape[1], depth.shape[0]) != self._raw_size:
             return None
         return self._rectifier.depth(depth)
+
+    def colour(self, i: int) -> UInt8:
+        """The picture of the i-th selected frame in colour (H, W, 3), BGR, same geometry as its image.
+
+        Raises:
+            InputError: the frame cannot be decoded.
+        """
+        index = int(self.indices[i])
+        try:
+            raw = self._raw_image(index)
+        except UnreadableFrameError as error:
+            raise InputError(f"{self.recording.source(index)}: {error}; leave this frame out") from None
+        colourless = raw.ndim == 2 or raw.shape[2] == 1
+        return self._rectifier.image(cv2.cvtColor(grey(raw), cv2.COLOR_GRAY2BGR) if colourless else raw[..., :3])
 
     def _frame(self, index: int) -> Frame | None:
         source = self.recording.source(index)
