@@ -18,7 +18,8 @@ import pytest
 from improvo.cli.main import main
 from improvo.export.model import segment_model
 from improvo.export.trajectory import export_trajectory
-from improvo.odometry.run_folder import RunFolder, read_map
+from improvo.odometry.map_file import read_map
+from improvo.odometry.run_folder import RunFolder
 from improvo.sequences import open_sequence, read_trajectory
 from improvo.stability.tables import read_tracks
 from improvo.types import Trajectory

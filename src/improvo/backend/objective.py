@@ -25,7 +25,13 @@ from improvo.types import Float64
 
 
 def points_in_cameras(problem: BundleProblem, cam_from_world: Float64, points: Float64) -> Float64:
-    """R_i X_j + t_i of every observation (O, 3)."""
+    """R_i X_j + t_i of every observation (O, 3).
+
+    Args:
+        problem: its observations, weights and K; its own poses and points are not used.
+        cam_from_world: (N, 4, 4) poses.
+        points: (M, 3) world.
+    """
     pose = cam_from_world[problem.camera_index]
     return np.einsum("oij,oj->oi", pose[:, :3, :3], points[problem.point_index]) + pose[:, :3, 3]
 
@@ -39,7 +45,14 @@ def away_from_zero(depth: Float64) -> Float64:
 def residuals(
     problem: BundleProblem, objective: ObjectiveSettings, cam_from_world: Float64, points: Float64
 ) -> Float64:
-    """(O, 4) residual vectors; the squared norm of a row is e_ij^2 + d(Z_ij)."""
+    """(O, 4) residual vectors; the squared norm of a row is e_ij^2 + d(Z_ij).
+
+    Args:
+        problem: its observations, weights and K; its own poses and points are not used.
+        objective: its constants.
+        cam_from_world: (N, 4, 4) poses.
+        points: (M, 3) world.
+    """
     K = problem.K
     x, y, z = points_in_cameras(problem, cam_from_world, points).T
     z_safe = away_from_zero(z)
@@ -68,11 +81,24 @@ def huber_slope(squared_norm: Float64, width: float) -> Float64:
 
 
 def cost(problem: BundleProblem, objective: ObjectiveSettings, cam_from_world: Float64, points: Float64) -> float:
-    """Omega."""
+    """The objective Omega.
+
+    Args:
+        problem: its observations, weights and K; its own poses and points are not used.
+        objective: its constants.
+        cam_from_world: (N, 4, 4) poses.
+        points: (M, 3) world.
+    """
     squared_norm = (residuals(problem, objective, cam_from_world, points) ** 2).sum(axis=1)
     return float(problem.weights @ huber(squared_norm, objective.huber_width))
 
 
 def reprojection_errors(problem: BundleProblem, cam_from_world: Float64, points: Float64) -> Float64:
-    """e_ij of every observation (O,), pixels."""
+    """e_ij of every observation (O,), pixels.
+
+    Args:
+        problem: its observations, weights and K; its own poses and points are not used.
+        cam_from_world: (N, 4, 4) poses.
+        points: (M, 3) world.
+    """
     return np.hypot(*residuals(problem, ObjectiveSettings(depth_weight=0.0), cam_from_world, points)[:, :2].T)

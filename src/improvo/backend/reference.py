@@ -14,9 +14,13 @@ _DIFFERENCE = 1e-6  # step of the central differences, radians and map units
 
 
 def perturb(problem: BundleProblem, cam_from_world: Float64, points: Float64, step: Float64) -> tuple[Float64, Float64]:
-    """Poses and points after a step (6 F + 3 P,): (v, w) of each free camera, then the move of each free point.
+    """Poses and points after a step. A pose is perturbed from the left: R, t become exp(w) R, exp(w) t + v.
 
-    A pose is perturbed from the left: R, t become exp(w) R, exp(w) t + v.
+    Args:
+        problem: its observations, and what is fixed.
+        cam_from_world: (N, 4, 4) poses.
+        points: (M, 3) world.
+        step: (6 F + 3 P,) (v, w) of each free camera, then the move of each free point.
     """
     free_cameras = ~np.asarray(problem.fixed_cameras, np.bool_)
     free_points = problem.free_points
@@ -29,7 +33,14 @@ def perturb(problem: BundleProblem, cam_from_world: Float64, points: Float64, st
 
 
 def jacobian(problem: BundleProblem, objective: ObjectiveSettings, cam_from_world: Float64, points: Float64) -> Float64:
-    """(4 O, 6 F + 3 P) central differences of the residuals by the step of `perturb`."""
+    """(4 O, 6 F + 3 P) central differences of the residuals by the step of `perturb`.
+
+    Args:
+        problem: its observations, and what is fixed.
+        objective: its constants.
+        cam_from_world: (N, 4, 4) poses.
+        points: (M, 3) world.
+    """
     size = 6 * int((~np.asarray(problem.fixed_cameras, np.bool_)).sum()) + 3 * int(problem.free_points.sum())
     columns = np.empty((4 * len(problem.camera_index), size))
     for k in range(size):
@@ -44,7 +55,14 @@ def jacobian(problem: BundleProblem, objective: ObjectiveSettings, cam_from_worl
 def normal_equations(
     problem: BundleProblem, objective: ObjectiveSettings, cam_from_world: Float64, points: Float64
 ) -> tuple[Float64, Float64]:
-    """Gauss-Newton Hessian and gradient of half the objective, the Huber loss as re-weighting."""
+    """Gauss-Newton Hessian and gradient of half the objective, the Huber loss as re-weighting.
+
+    Args:
+        problem: its observations, and what is fixed.
+        objective: its constants.
+        cam_from_world: (N, 4, 4) poses.
+        points: (M, 3) world.
+    """
     residual = residuals(problem, objective, cam_from_world, points)
     weight = problem.weights * huber_slope((residual**2).sum(axis=1), objective.huber_width)
     J = jacobian(problem, objective, cam_from_world, points)
@@ -55,7 +73,13 @@ def normal_equations(
 def solve_dense(
     problem: BundleProblem, objective: ObjectiveSettings, iterations: int = 50
 ) -> tuple[Float64, Float64, float]:
-    """Levenberg-Marquardt with the simplest damping there is: (poses, points, cost)."""
+    """Levenberg-Marquardt with the simplest damping there is: (poses, points, cost).
+
+    Args:
+        problem: where it starts, too.
+        objective: its constants.
+        iterations: steps, at most.
+    """
     poses, points = np.array(problem.cam_from_world), np.array(problem.points)
     best, damping = cost(problem, objective, poses, points), 1e-4
     for _ in range(iterations):

@@ -20,6 +20,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "improve": ("improve", "the main job: label video, train the frontend with the labels, keep it if it got better"),
     "run": ("run", "visual odometry on one sequence: trajectory, map, tracks"),
     "evaluate": ("evaluate", "how good a frontend or a trajectory is: the paper's protocols"),
+    "truth": ("truth", "reference poses and camera of a recording by structure from motion"),
     "train": ("train", "teach the network: drawn shapes, homographies"),
     "show": ("show", "the pictures of the paper, from a run, a recording or an evaluation"),
     "report": ("report", "one HTML page about a run, labels or an evaluation"),

@@ -14,7 +14,7 @@ from improvo.cli.options import (
     add_sequence_arguments,
     settings_from,
 )
-from improvo.odometry.run_settings import RunSettings
+from improvo.depth.run_settings import DenseRunSettings
 
 if TYPE_CHECKING:
     from improvo.odometry.run import RunSummary
@@ -27,7 +27,7 @@ _FLAGS = {**FRONTEND_FLAGS, "initialisation": "odometry.mode"}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `improvo run`."""
-    defaults = RunSettings()
+    defaults = DenseRunSettings()
     parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a video, an image folder or a data set")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
     add_frontend_arguments(parser, defaults.frontend.name, defaults.frontend.max_keypoints)
@@ -40,6 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-stability", action="store_true", help="weigh all observations alike (default: by stability)"
     )
+    parser.add_argument(
+        "--dense", action="store_true", help="add depth maps (depth.zip) and a coloured point cloud (dense.ply)"
+    )
     parser.add_argument("--view", action="store_true", help="watch the run in Rerun (pip install 'improvo[view]')")
     parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="record it for Rerun; works without a screen")
     parser.add_argument(
@@ -51,14 +54,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Track the sequence and write the results; 130 after an interrupt."""
-    settings = settings_from(RunSettings, arguments, _FLAGS)
-    if arguments.no_stability:
-        settings = settings_from(RunSettings, arguments, _FLAGS, extra=["frontend.use_stability=false"])
+    extra = ["frontend.use_stability=false"] if arguments.no_stability else []
+    extra += ["dense=true"] if arguments.dense else []
+    settings = settings_from(DenseRunSettings, arguments, _FLAGS, extra=extra)
     from improvo.files import check_output_folder
     from improvo.sequences import open_sequence
 
     check_output_folder(arguments.output, "run")
     sequence = open_sequence(arguments.sequence, settings.sequence)
+    if settings.dense:
+        from improvo.depth.dense import refuse_live
+
+        refuse_live(sequence)
     camera = sequence.camera
     frames = "live, Ctrl-C ends it: frames" if sequence.length is None else f"{sequence.length} frames"
     print(
@@ -69,12 +76,15 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"note: {note}")
     summary = _track(sequence, arguments.output, settings, _viewer(arguments))
     _print_summary(summary)
+    interrupted = bool(summary.report["interrupted"])
+    if settings.dense and not interrupted:
+        interrupted = _add_depth(sequence, summary, settings)
     if arguments.report:
         from improvo.report.pages import write_report
 
         write_report(arguments.output, arguments.output / "report.html")
         print(f"page in {arguments.output / 'report.html'}")
-    return 130 if summary.report["interrupted"] else 0
+    return 130 if interrupted else 0
 
 
 def _viewer(arguments: argparse.Namespace) -> Visualizer | None:
@@ -86,7 +96,7 @@ def _viewer(arguments: argparse.Namespace) -> Visualizer | None:
     return RerunViewer(arguments.save)
 
 
-def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: Visualizer | None) -> RunSummary:
+def _track(sequence: Sequence, folder: Path, settings: DenseRunSettings, viewer: Visualizer | None) -> RunSummary:
     """The run with its progress line."""
     from tqdm import tqdm
 
@@ -101,6 +111,23 @@ def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: Visu
             bar.update()
 
         return run_odometry(sequence, folder, settings, visualizer=viewer, progress=progress)
+
+
+def _add_depth(sequence: Sequence, summary: RunSummary, settings: DenseRunSettings) -> bool:
+    """Depth maps and cloud with their progress line; whether they were interrupted."""
+    from tqdm import tqdm
+
+    from improvo.depth.compile import compile_depth
+    from improvo.depth.dense import write_dense
+
+    compile_depth(lambda words: print(words, file=sys.stderr))
+    with tqdm(total=summary.tracked, unit="frame", desc="depth", smoothing=0.1, delay=0.5) as bar:
+        entry = write_dense(sequence, summary, settings.depth, bar.update)
+    print(
+        f"depth of {entry['frames']} frames in depth.zip, {100 * entry['share']:.0f} % of their pixels; "
+        f"{entry['points']} points in dense.ply"
+    )
+    return bool(entry["interrupted"])
 
 
 def _print_summary(summary: RunSummary) -> None:

@@ -19,15 +19,23 @@ class PairGeometry:
 
     camera: Camera  # pinhole, of both images
     b_from_a: Float64  # (4, 4) true motion from the camera of image A to that of image B
-    depth_a: Float32  # (H, W) metres, NaN where missing
+    depth_a: Float32  # (H, W) metres, NaN where missing; may be smaller than the image
     depth_b: Float32 | None  # where there is one, it tells which points of A are hidden in B
     sampling: str = "bilinear"
     edge: float = 0.05  # relative depth difference that makes a discontinuity
 
     def points_a(self, keypoints: Float32) -> Float64:
         """3D points (N, 3) in the camera of A at keypoints (N, 2) of A; NaN where there is no trusted depth."""
-        depth = depth_at(keypoints, self.depth_a, self.sampling, self.edge)
+        depth = depth_at(self.in_map(keypoints, self.depth_a), self.depth_a, self.sampling, self.edge)
         return self.camera.unproject(keypoints.astype(np.float64), depth)
+
+    def in_map(self, keypoints: Float32, depth: Float32) -> Float32:
+        """Keypoints (N, 2) of the image as pixels of its depth map: pixel edges map to pixel edges."""
+        height, width = depth.shape
+        if (width, height) == (self.camera.width, self.camera.height):
+            return keypoints
+        scale = np.array([width / self.camera.width, height / self.camera.height], np.float32)
+        return ((keypoints + 0.5) * scale - 0.5).astype(np.float32)
 
     def project_to_b(self, points_a: Float64) -> tuple[Float64, Float64]:
         """True pixels (N, 2) in B of points (N, 3) in A, and their depth (N,) there; pixels NaN behind the camera."""
@@ -62,9 +70,13 @@ class PoseError:
 
 
 def right_matches(geometry: PairGeometry, points_a: Float64, pixels_b: Float64, max_error: float) -> NDArray[np.bool_]:
-    """Whether matches (N,) are right: the point of A lands, by true pose and depth, closer than `max_error` px in B.
+    """Whether matches (N,) are right: the point of A lands, by true pose and depth, near its match in B.
 
-    Only matches whose keypoint in A has trusted depth can be judged; leave the others out before the call.
+    Args:
+        geometry: of the pair.
+        points_a: (N, 3) in the camera of A; matches without trusted depth are left out before the call.
+        pixels_b: (N, 2) where they were matched in B.
+        max_error: pixels; right is strictly below.
     """
     projected, _ = geometry.project_to_b(points_a)
     return np.asarray(np.linalg.norm(projected - pixels_b, axis=1) < max_error)
@@ -78,6 +90,12 @@ def repeated_keypoints(
     A keypoint of A counts as visible if it has trusted depth, lands inside B, and is not hidden there: where B has a
     depth map, the depth at that place must be known and agree within `hidden` (relative).
 
+    Args:
+        geometry: of the pair.
+        keypoints_a, keypoints_b: (N, 2) and (M, 2) pixels.
+        max_error: pixels; repeated is strictly below.
+        hidden: relative difference of depth beyond which a point is hidden.
+
     Returns:
         (visible, repeated)
     """
@@ -88,7 +106,8 @@ def repeated_keypoints(
     inside = (pixels >= 0).all(axis=1) & (pixels[:, 0] <= camera.width - 1) & (pixels[:, 1] <= camera.height - 1)
     pixels, z = pixels[inside], z[inside]
     if geometry.depth_b is not None and len(pixels):
-        seen = depth_at(pixels.astype(np.float32), geometry.depth_b, geometry.sampling, geometry.edge)
+        places = geometry.in_map(pixels.astype(np.float32), geometry.depth_b)
+        seen = depth_at(places, geometry.depth_b, geometry.sampling, geometry.edge)
         pixels = pixels[np.abs(seen - z) <= hidden * z]  # NaN, a hole of B, is not counted
     if len(pixels) == 0 or len(keypoints_b) == 0:
         return len(pixels), 0

@@ -1,4 +1,4 @@
-"""Accuracy over thresholds, the area under it, and bootstrap intervals."""
+"""Accuracy over thresholds, the areas under curves, and bootstrap intervals."""
 
 from __future__ import annotations
 
@@ -26,6 +26,27 @@ def area_shares(errors: Float64, limit: float) -> Float64:
     return np.clip(1.0 - errors / limit, 0.0, None)
 
 
+def average_precision(scores: Float64, right: NDArray[np.bool_], possible: int | None = None) -> float | None:
+    """Precision averaged over the steps of recall; detections of equal score count as one step.
+
+    Args:
+        scores: (N,) of the detections, larger is accepted earlier.
+        right: (N,) whether a detection is right.
+        possible: number of right detections there could be; by default those of `right`.
+
+    Returns:
+        None where nothing could be right.
+    """
+    possible = int(right.sum()) if possible is None else possible
+    if possible == 0:
+        return None
+    order = np.argsort(-scores, kind="stable")
+    hits = np.cumsum(right[order])
+    last = np.flatnonzero(np.diff(scores[order], append=np.nan))  # of each step
+    precision = hits[last] / (last + 1)
+    return float((np.diff(hits[last] / possible, prepend=0.0) * precision).sum())
+
+
 class Bootstrap:
     """Percentile intervals of means over the same resamples of the same trials (Efron 1979).
 
@@ -46,5 +67,13 @@ class Bootstrap:
 
     def interval(self, values: NDArray[np.generic]) -> tuple[float, float]:
         """Interval of the mean of finite `values` (N,)."""
-        low, high = np.percentile(self._weights @ values.astype(np.float32), self._percentiles)
+        return self.percentiles(self.means(values))
+
+    def means(self, values: NDArray[np.generic]) -> Float64:
+        """Mean of finite `values` (N,) in every resample."""
+        return np.asarray(self._weights @ values.astype(np.float32))
+
+    def percentiles(self, means: Float64) -> tuple[float, float]:
+        """The interval that holds the chosen share of the resampled `means`."""
+        low, high = np.percentile(means, self._percentiles)
         return float(low), float(high)

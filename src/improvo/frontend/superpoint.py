@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -105,8 +106,9 @@ def sample(cells: Tensor, keypoints: Tensor) -> Tensor:
     Returns:
         (B, N, C)
     """
-    size = keypoints.new_tensor([cells.shape[-1] * CELL, cells.shape[-2] * CELL])
-    grid = (keypoints + 0.5) / size * 2 - 1  # with align_corners=False, -1 and 1 are the image's outer edges
+    sides = cells.shape[-1] * CELL, cells.shape[-2] * CELL
+    # with align_corners=False, -1 and 1 are the image's outer edges
+    grid = torch.stack([(keypoints[..., axis] + 0.5) / side * 2 - 1 for axis, side in enumerate(sides)], dim=-1)
     values = functional.grid_sample(cells, grid[:, None], mode="bilinear", padding_mode="border", align_corners=False)
     return values[:, :, 0].transpose(1, 2)
 

@@ -31,7 +31,12 @@ class Similarity:
 
 
 def align_points(target: Float64, source: Float64, with_scale: bool) -> Similarity:
-    """The similarity (or rigid motion) that carries `source` (N, 3) onto `target` (N, 3), least squares.
+    """The similarity (or rigid motion) that carries one set of points onto another, least squares.
+
+    Args:
+        target: (N, 3).
+        source: (N, 3), row by row the same points in another frame.
+        with_scale: find the scale too; else it is 1.
 
     Raises:
         InputError: fewer than three points, or all on one spot (rotation or scale undefined).

@@ -85,7 +85,13 @@ def relative_pose(pixels_a: Float64, pixels_b: Float64, camera: Camera, ransac: 
 
 
 def homography(pixels_a: Float64, pixels_b: Float64, ransac: Ransac) -> RobustHomography:
-    """The homography from pixels (N, 2) of one view to those (N, 2) of another."""
+    """The homography between two views from 2D-to-2D matches.
+
+    Args:
+        pixels_a: (N, 2) pixels in the first view.
+        pixels_b: (N, 2) pixels in the second view.
+        ransac: sampling and threshold.
+    """
     matrix, report = poselib.estimate_homography(pixels_a, pixels_b, ransac._options("max_reproj_error"))
     return RobustHomography(np.asarray(matrix), np.asarray(report["inliers"], np.bool_))
 
@@ -105,7 +111,13 @@ def motions_of_homography(b_from_a: Float64, camera: Camera) -> list[Float64]:
 
 
 def rotation_residuals(camera: Camera, pixels_a: Float64, pixels_b: Float64) -> Float64:
-    """Pixels (N,) that the best pure rotation of the camera leaves of matches (N, 2); robust to moderate outliers."""
+    """Pixels (N,) that the best pure rotation of the camera leaves unexplained; robust to moderate outliers.
+
+    Args:
+        camera: pinhole, of both views.
+        pixels_a: (N, 2) pixels in the first view.
+        pixels_b: (N, 2) pixels in the second view.
+    """
     rays_a, rays_b = camera.unproject(pixels_a), camera.unproject(pixels_b)
     rays_a /= np.linalg.norm(rays_a, axis=1, keepdims=True)
     rays_b /= np.linalg.norm(rays_b, axis=1, keepdims=True)
@@ -140,7 +152,13 @@ def sampson_errors(b_from_a: Float64, camera: Camera, pixels_a: Float64, pixels_
 
 
 def epipolar_lines(b_from_a: Float64, camera: Camera, pixels_a: Float64) -> Float64:
-    """Lines (N, 3) in the second view, u x + v y + w = 0 in pixels, on which pixels (N, 2) of the first view lie."""
+    """Lines (N, 3) in the second view on which the pixels of the first lie: u x + v y + w = 0 in pixels.
+
+    Args:
+        b_from_a: (4, 4).
+        camera: pinhole, of both views.
+        pixels_a: (N, 2) pixels in the first view.
+    """
     inverse_k = np.linalg.inv(camera.K)
     fundamental = inverse_k.T @ skew(b_from_a[:3, 3]) @ b_from_a[:3, :3] @ inverse_k
     return np.column_stack([pixels_a, np.ones(len(pixels_a))]) @ fundamental.T

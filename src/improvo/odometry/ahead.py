@@ -1,4 +1,4 @@
-"""Reading, detecting and matching ahead of the backend, in a second thread, so that two cores are used."""
+"""Look-ahead: a second thread reads, detects and matches while the backend adjusts, so that two cores are used."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from improvo.odometry.visual_odometry import MatchedFeatures
 from improvo.types import Features, Frame, UInt8
 
-_AHEAD = 2  # frames; more would only cost memory
+_AHEAD = 2  # frames; more cost memory and save no time
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,11 @@ def detected_ahead(
     """The frames in order with their features and matches, computed ahead by one worker thread.
 
     An error of a frame is raised when its turn comes, so that everything before it is processed.
+
+    Args:
+        frames: read in the worker thread.
+        detect: features of an image (H, W).
+        match: matches a frame's features with those of the frame before; called in order.
     """
     iterator = iter(frames)
 

@@ -25,8 +25,18 @@ def compile_odometry(progress: Callable[[str], None] | None = None) -> None:
     if progress is not None and not (kernels_are_cached() and all_cached(_OTHER_KERNELS)):
         progress("compiling the odometry (once, about 20 s)")
     compile_kernels()
+    _compile_matching()
+    _compile_corners()
+
+
+def _compile_matching() -> None:
+    """Of frames, and of projected map points: float32 descriptors, float64 pixels."""
     descriptors = np.eye(4, dtype=np.float32)
-    keypoints = 10.0 * np.arange(8.0).reshape(4, 2)
+    pixels = np.arange(8.0).reshape(4, 2)
     matching.match_units(descriptors, descriptors)
-    projection_search.match_by_projection(keypoints, descriptors, keypoints, descriptors, radius=2.0, max_distance=0.7)
-    corners.refine_to_corners(np.zeros((80, 80), np.float32), keypoints.astype(np.float32), radius=2)
+    projection_search.match_by_projection(pixels, descriptors, pixels, descriptors, radius=2.0, max_distance=0.7)
+
+
+def _compile_corners() -> None:
+    """What moves a network's keypoints to corners: a float32 image and float32 pixels."""
+    corners.refine_to_corners(np.zeros((40, 40), np.float32), np.full((1, 2), 20.0, np.float32), radius=2)

@@ -1,7 +1,8 @@
-"""Does the map still agree with the pictures? An independent two-view check, and what it answers.
+"""Is the map right? An independent check against fresh two-view geometry.
 
-A wrong map can fit its own tracks well: it chose them, and lets go of what does not fit. Two views matched afresh
-and their own essential matrix know nothing of the map; where both are sure and disagree, the map is wrong.
+A wrong map can fit its own tracks well, because observations that do not fit are dropped. The essential matrix of two
+views that are matched afresh does not depend on the map. If many matches support it and they do not fit the map's
+relative pose, the map is wrong.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from improvo.odometry.view import View, ransac_pairs
 from improvo.tracking.matching import match_units
 from improvo.types import Int64
 
-_FEATURES = 600  # the strongest of each view; all of them would only cost time
+_FEATURES = 600  # of each view, the strongest; more cost time and change nothing
 
 
 @dataclass(frozen=True)
@@ -33,10 +34,15 @@ class Agreement:
 
 
 class HealthCheck:
-    """Compares the map with two-view geometry every few frames, and says when it contradicts the map.
+    """Compares the map with two-view geometry every few frames.
 
-    Measured on five real sequences with three frontends: over three checks a right map keeps at least 90 % of the
-    inliers, a mirrored or otherwise wrong one at most 80 % (docs/odometry.md).
+    On five real sequences with three frontends a right map keeps at least 90 % of the two views' own inliers over
+    three checks; a mirrored or otherwise wrong one keeps at most 80 % (docs/odometry.md).
+
+    Args:
+        camera: pinhole camera of the views.
+        settings: of the odometry; `health`, `ransac_gate` and `seed` are used.
+        descriptor_distance: the matching threshold on unit descriptors.
     """
 
     def __init__(self, camera: Camera, settings: OdometrySettings, descriptor_distance: float) -> None:
@@ -73,10 +79,17 @@ class HealthCheck:
 
 
 def agreement(a: View, b: View, camera: Camera, descriptor_distance: float, settings: OdometrySettings) -> Agreement:
-    """Match two views with poses afresh, and count.
+    """Match two views with poses afresh, and count the matches that fit each of the two relative poses.
 
-    The two views' own geometry comes from trusted matches, or a crowd's motion would pass for it; all matches are
-    counted, or too few would be left to say that a map is wrong.
+    Only matches that pass the RANSAC gate are sampled, so that a crowd's motion is not taken for the camera's. All
+    matches are counted, since those that pass the gate can be too few to show that a map is wrong.
+
+    Args:
+        a: the earlier view.
+        b: the later view.
+        camera: pinhole, of both.
+        descriptor_distance: the matching threshold on unit descriptors.
+        settings: of the odometry.
     """
     assert a.cam_from_world is not None
     assert b.cam_from_world is not None

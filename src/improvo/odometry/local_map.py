@@ -1,4 +1,4 @@
-"""The map around the camera: pose of a new view, lost points found again, new points triangulated."""
+"""The map around the camera: the pose of a new view, search by projection, and new points."""
 
 from __future__ import annotations
 
@@ -41,10 +41,16 @@ class LocalMap:
         self.history.append(view)
 
     def localise(self, view: View, neighbour: View) -> tuple[int, float]:
-        """Pose of `view` from the map points that its tracks share with `neighbour` (PnP, then lost points again).
+        """Pose of a view from the map points that its tracks share with a neighbour: PnP, then search by projection.
+
+        If they are too few, the view is matched by descriptors with earlier views, the newest first.
+
+        Args:
+            view: gets a pose and points; neither if it shows too little of the map.
+            neighbour: a view of the map, just before or after.
 
         Returns:
-            Number of inliers, and their share of the 3D-to-2D matches tried; (0, 0) leaves the view without a pose.
+            Number of PnP inliers, and their share of the 3D-to-2D matches.
         """
         inherit_points(view, neighbour)
         inliers, share = self._solve_pose(view)
@@ -73,7 +79,7 @@ class LocalMap:
         view.points[matches[:, 1]] = earlier.points[rows[matches[:, 0]]]
 
     def _solve_pose(self, view: View) -> tuple[int, float]:
-        """RANSAC PnP on the trusted points; whatever does not fit the pose loses its point."""
+        """PnP on the points that pass the RANSAC gate; a keypoint that does not fit the pose loses its point."""
         rows = view.observed
         if len(rows) < 4:
             return 0, 0.0
@@ -94,7 +100,7 @@ class LocalMap:
         return int(inliers.sum()), float(inliers.mean())
 
     def _search_by_projection(self, view: View) -> None:
-        """Points of the last frames that should be visible take a free keypoint near their projection."""
+        """Points of the last frames that the view should see take a free keypoint near their projection."""
         assert view.cam_from_world is not None
         ids, descriptors = self._points_to_search(view)
         projections, inside = self.project(view.cam_from_world, self.store.xyz[ids])
@@ -133,7 +139,15 @@ class LocalMap:
         return pixels, in_front & inside
 
     def triangulate(self, view: View, others: Iterable[View]) -> int:
-        """New points from the view's tracks that have no point yet, over `others`; returns how many."""
+        """New map points from tracks of the view that have none yet.
+
+        Args:
+            view: the newest view, with a pose.
+            others: views with poses in which the tracks may have been seen.
+
+        Returns:
+            How many points were made.
+        """
         tracks = view.tracks[view.points < 0]
         views = [view, *others]
         seen = [(v, np.flatnonzero(np.isin(v.tracks, tracks) & (v.points < 0))) for v in views]

@@ -1,4 +1,4 @@
-"""Finding lost map points again: each projected point takes the most similar free keypoint near its projection."""
+"""Search by projection: each projected map point takes the most similar free keypoint near its projection."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from improvo.frontend import Frontend
 from improvo.frontend.registry import load_odometry_frontend
 from improvo.geometry.trajectory_files import write_trajectory
 from improvo.odometry.ahead import detected_ahead
-from improvo.odometry.ply import write_ply
+from improvo.odometry.map_file import write_map
 from improvo.odometry.recorder import TrackRecorder
 from improvo.odometry.run_settings import RunSettings
 from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
@@ -95,7 +95,7 @@ def run_odometry(
             raise InputError(f"{sequence.path}: only {len(processed)} of its frames can be read; check the recording")
     trajectory = odometry.trajectory
     write_trajectory(folder / "trajectory.txt", trajectory)
-    write_ply(folder / "map.ply", odometry.map)
+    write_map(folder / "map.ply", odometry.map)
     seconds["total"] = time.perf_counter() - started
     report = _report(sequence, settings, frontend, odometry, processed, interrupted, recorder.counts, seconds)
     write_json(folder / "run.json", report)
@@ -134,7 +134,7 @@ def _track_all(
 
 @contextmanager
 def _interrupts_wait() -> Iterator[None]:
-    """Ctrl-C takes effect at the end: compiled code would make a SystemError of it, and half a frame would be left."""
+    """Ctrl-C takes effect at the end of the block. Within compiled code it would come out as a SystemError."""
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler or current_thread() is not main_thread():
         yield
         return

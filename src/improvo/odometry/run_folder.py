@@ -15,6 +15,7 @@ from improvo import config
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
 from improvo.geometry.trajectory_files import read_trajectory
+from improvo.odometry.map_file import read_map
 from improvo.sequences import Sequence, SequenceSettings, open_sequence
 from improvo.stability.rule import IGNORE
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
@@ -25,7 +26,6 @@ _MENDS = {  # by a word of the reason
     "parallax": "the camera turned or stood still: move it sideways at the start (`improvo info` shows what it sees)",
     "match": "`improvo info` tells whether the pictures are dark, blurred or without texture",
 }
-_PLY_TYPES = {"float": "<f4", "double": "<f8", "int": "<i4", "uint": "<u4", "uchar": "u1", "short": "<i2"}
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class RunFolder:
 
     def colour(self, frame_index: int) -> UInt8:
         """The same in colour, (H, W, 3) RGB; three equal channels where the recording has none."""
-        return self.sequence.colour(self._row(frame_index))
+        return np.ascontiguousarray(self.sequence.colour(self._row(frame_index))[..., ::-1])
 
     def _row(self, frame_index: int) -> int:
         """The row of the recording's sequence that a processed frame is."""
@@ -230,38 +230,3 @@ def _with_present_names(report: dict[str, Any]) -> dict[str, Any]:
     for event in events:
         event["kind"] = _FORMER_KINDS.get(event["kind"], event["kind"])
     return {**report, "events": events, "configuration": config.with_present_names(report.get("configuration", {}))}
-
-
-def read_map(path: Path) -> SparseMap:
-    """Read the `map.ply` of a run.
-
-    Raises:
-        InputError: missing, damaged, or not written by improvo.
-    """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); `improvo run` writes it") from None
-    header, separator, body = content.partition(b"end_header\n")
-    lines = header.decode("ascii", "replace").split("\n")
-    count = next((int(line.split()[2]) for line in lines if line.startswith("element vertex")), -1)
-    properties = [line.split() for line in lines if line.startswith("property")]
-    if not separator or count < 0 or "format binary_little_endian 1.0" not in lines:
-        raise InputError(f"{path}: is no map that improvo wrote; run `improvo run` again")
-    try:
-        dtype = np.dtype([(name, _PLY_TYPES[kind]) for _, kind, name in properties])
-        vertices = np.frombuffer(body, dtype, count)
-        xyz = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
-        mean_error = vertices["mean_error"].astype(np.float64)
-        return SparseMap(
-            ids=np.arange(count),
-            xyz=xyz,
-            observations=vertices["observations"].astype(np.int64),
-            mean_error=mean_error,
-            max_error=np.full(count, np.nan),
-            segment=vertices["segment"].astype(np.int64),
-        )
-    except (ValueError, KeyError) as error:
-        raise InputError(
-            f"{path}: is damaged or no map that improvo wrote ({error}); run `improvo run` again"
-        ) from None

@@ -1,4 +1,4 @@
-"""One frame as the odometry holds it, and the points that its views observe."""
+"""A frame as the odometry holds it, and the store of the points that it observes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(eq=False)
 class View:
-    """A frame with its features, tracks, map points and pose; mutable, internal to the odometry."""
+    """A frame with its features, tracks, map points and pose. Mutable; only the odometry changes it."""
 
     frame_index: int  # in the processed sequence, 0-based
     time: float

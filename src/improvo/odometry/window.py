@@ -13,7 +13,7 @@ from improvo.backend.solver import solve
 from improvo.odometry.view import NO_POINT, Mask, PointStore, View
 from improvo.types import Float64, Int64
 
-_WORTH_SOLVING_AGAIN = 0.01  # share of observations dropped; fewer hardly move the optimum, the next frame solves it
+_WORTH_SOLVING_AGAIN = 0.01  # share of observations dropped; where fewer were, the next frame's solve is enough
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,19 @@ def adjust(
     solver: SolverSettings,
     max_error: float | None,
 ) -> WindowReport:
-    """Adjust the poses of `free` and all points that they observe; poses of `fixed` stay.
+    """Adjust the poses of free views and all points that they observe.
 
-    Observations that end over `max_error` pixels or behind the camera are dropped, and the window is solved again if
-    they were many; None drops nothing (mode `paper`).
+    Observations that end over the largest error or behind the camera are dropped. If they were many, the window is
+    solved again.
+
+    Args:
+        free: views whose poses are adjusted.
+        fixed: views whose poses stay; their observations of the same points count.
+        store: the points; adjusted in place.
+        K: (3, 3) intrinsic matrix.
+        objective: of the bundle adjustment.
+        solver: when it stops.
+        max_error: pixels; None drops nothing (mode `paper`).
     """
     views = [*free, *fixed]
     is_fixed = np.arange(len(views)) >= len(free)

@@ -117,23 +117,6 @@ class Sequence:
             if frame is not None:
                 yield frame
 
-    def colour(self, i: int) -> UInt8:
-        """The i-th selected frame in colour, (H, W, 3) RGB, same geometry as its grey image.
-
-        Three equal channels where the recording has no colour.
-
-        Raises:
-            IndexError: there is no such row.
-            InputError: the frame cannot be decoded.
-        """
-        index = int(self.indices[i])
-        try:
-            image = self._rectifier.image(self._raw_image(index))
-        except UnreadableFrameError as error:
-            raise InputError(f"{self.recording.source(index)}: {error}; leave this frame out") from None
-        code = cv2.COLOR_GRAY2RGB if image.ndim == 2 or image.shape[2] == 1 else cv2.COLOR_BGR2RGB
-        return np.asarray(cv2.cvtColor(image[..., :3] if image.ndim == 3 else image, code))
-
     def row(self, frame: Frame) -> int:
         """The row of a delivered frame in `times` and `ground_truth`, and the argument of `depth` for it."""
         return int(np.searchsorted(self.indices, frame.source_index))
@@ -151,6 +134,20 @@ class Sequence:
         if depth is None or (depth.shape[1], depth.shape[0]) != self._raw_size:
             return None
         return self._rectifier.depth(depth)
+
+    def colour(self, i: int) -> UInt8:
+        """The picture of the i-th selected frame in colour (H, W, 3), BGR, same geometry as its image.
+
+        Raises:
+            InputError: the frame cannot be decoded.
+        """
+        index = int(self.indices[i])
+        try:
+            raw = self._raw_image(index)
+        except UnreadableFrameError as error:
+            raise InputError(f"{self.recording.source(index)}: {error}; leave this frame out") from None
+        colourless = raw.ndim == 2 or raw.shape[2] == 1
+        return self._rectifier.image(cv2.cvtColor(grey(raw), cv2.COLOR_GRAY2BGR) if colourless else raw[..., :3])
 
     def _frame(self, index: int) -> Frame | None:
         source = self.recording.source(index)

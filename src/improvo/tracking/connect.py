@@ -8,13 +8,21 @@ from improvo.types import Int64
 
 
 class TrackChain:
-    """Gives every keypoint of every frame its track id."""
+    """Gives every keypoint of every frame its track id.
+
+    A keypoint that matches one of the frame before belongs to that one's track; any other begins a new track. Ids rise
+    and are never used again, so a track that is interrupted goes on under another id.
+    """
 
     def __init__(self) -> None:
         self._next_track = 0
 
     def start(self, count: int) -> Int64:
-        """Track ids (count,) of keypoints that begin new tracks."""
+        """Track ids (count,) of keypoints that begin new tracks, as all of the first frame do.
+
+        Args:
+            count: keypoints.
+        """
         ids = np.arange(self._next_track, self._next_track + count, dtype=np.int64)
         self._next_track += count
         return ids

@@ -51,7 +51,8 @@ def info_nce_loss(
     scale: Tensor,
     masked_pixels: float,
     negative: Tensor | None = None,
-    across: bool = False,
+    group: int = 1,
+    scenes: Tensor | None = None,
 ) -> Tensor:
     """Symmetric InfoNCE over sparse correspondences: each descriptor must pick its partner among those of its pair.
 
@@ -61,13 +62,16 @@ def info_nce_loss(
         valid: (B, N) bool.
         scale: () inverse temperature.
         negative: (B, N) bool, which rows may be wrong partners of others; the valid ones where it is not given.
-        across: the points of the other pairs are negatives too.
+        group: so many consecutive pairs have their points for each other's negatives too; B must be a multiple.
+        scenes: (B,) int; pairs of the same scene, which may show the same places, are not each other's negatives.
     """
     negative = valid if negative is None else negative
-    near = (torch.cdist(points_a, points_a) < masked_pixels) | (torch.cdist(points_b, points_b) < masked_pixels)
-    if across:  # one large pair, in which only points of the same view can be near each other
-        near = torch.block_diag(*near)[None]
-        a, b, valid, negative = (part.flatten(0, 1)[None] for part in (a, b, valid, negative))
+    # not by matrix products, which may run in low precision
+    near = _near(points_a, masked_pixels) | _near(points_b, masked_pixels)
+    if group > 1:  # large pairs, in which only points of the same view can be near each other
+        near = _grouped(near, group, scenes)
+        a, b = (part.reshape(-1, group * part.shape[1], part.shape[2]) for part in (a, b))
+        valid, negative = (part.reshape(-1, group * part.shape[1]) for part in (valid, negative))
     refused = near | ~negative[:, None, :] | ~negative[:, :, None]
     itself = torch.eye(a.shape[1], dtype=torch.bool, device=a.device)
     similarity = (scale * torch.einsum("bnd,bmd->bnm", a, b)).masked_fill(refused & ~itself, -1e4)
@@ -76,6 +80,30 @@ def info_nce_loss(
     right = torch.diagonal(similarity, dim1=1, dim2=2)
     loss = 0.5 * (forward + backward) - right
     return (loss * valid).sum() / valid.sum().clamp(min=1)
+
+
+def _grouped(near: Tensor, group: int, scenes: Tensor | None) -> Tensor:
+    """(B / group, group·N, group·N) what may not be told apart, from that of each pair (B, N, N)."""
+    pairs, points, _ = near.shape
+    alike = torch.zeros(pairs // group, group, group, dtype=torch.bool, device=near.device)
+    if scenes is not None:
+        within = scenes.view(-1, group)
+        alike = within[:, :, None] == within[:, None, :]
+    refused = alike[:, :, None, :, None].repeat(1, 1, points, 1, points)
+    for row in range(group):
+        refused[:, row, :, row] = near.view(-1, group, points, points)[:, row]
+    return refused.view(-1, group * points, group * points)
+
+
+def held_loss(logits: Tensor, teacher: Tensor) -> Tensor:
+    """Divergence (Kullback-Leibler) of the softmax over channels from the teacher's, mean over cells.
+
+    Args:
+        logits, teacher: (B, C, Hc, Wc).
+    """
+    wanted = functional.log_softmax(teacher.float(), dim=1)
+    given = functional.log_softmax(logits.float(), dim=1)
+    return (wanted.exp() * (wanted - given)).sum(dim=1).mean()
 
 
 def hinge_loss(
@@ -117,3 +145,9 @@ def stability_loss(logits: Tensor, stability: Tensor, stable_per_unstable: float
     errors = functional.cross_entropy(logits.transpose(1, 2), stability, ignore_index=IGNORED, reduction="none")
     stable, unstable = ((errors * (stability == code)).sum() for code in (1, 0))
     return 0.5 * (stable + stable_per_unstable * unstable) / (stability == 1).sum().clamp(min=1)
+
+
+def _near(points: Tensor, radius: float) -> Tensor:
+    """(B, N, N) whether two points (B, N, 2) of a view are nearer than a radius; not by `cdist`, slow on a GPU."""
+    x, y = points[..., 0], points[..., 1]
+    return (x[:, :, None] - x[:, None]) ** 2 + (y[:, :, None] - y[:, None]) ** 2 < radius**2

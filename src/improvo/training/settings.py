@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from improvo.errors import ConfigError
+
 
 @dataclass(frozen=True)
 class OptimiserSettings:
@@ -173,3 +175,62 @@ class OdometryTrainingSettings:
     )
     views: ViewSettings = field(default_factory=ViewSettings)
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
+
+
+@dataclass(frozen=True)
+class DevicePairSettings:
+    """Which pairs are made on the device, and what is taught about them."""
+
+    posed_share: float = 0.5  # of the pairs are of frames of posed sequences, where such are given
+    two_frames: bool = True  # those show two frames, related by depth and poses; False: one frame twice, the control
+    largest_gap: float = 3.0  # seconds between two frames
+    least_overlap: float = 0.2  # share of either frame that the other shows
+    depth_tolerance: float = 0.03  # of two frames' depths of a point, relative; beyond it something hides the point
+    points: int = 384  # correspondences taught per pair, at most
+    keypoint_share: float = 0.5  # of them are keypoints of the detector that is held, the rest lie anywhere
+    group: int = 4  # so many pairs are each other's wrong partners
+
+    def __post_init__(self) -> None:
+        for name in ("posed_share", "keypoint_share", "least_overlap"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"setting `pairs.{name}`: {getattr(self, name)} must lie between 0 and 1")
+        if self.points < 2 or self.group < 1:
+            raise ConfigError("settings `pairs.points` and `pairs.group`: at least 2 points and groups of 1")
+        if self.largest_gap <= 0 or self.depth_tolerance <= 0:
+            raise ConfigError("settings `pairs.largest_gap` and `pairs.depth_tolerance`: must be above 0")
+
+
+@dataclass(frozen=True)
+class HeldSettings:
+    """Descriptors trained on, while detector and stability are held to what other weights say of the same views."""
+
+    longer_side: int = 640  # pixels; larger pictures are reduced on loading
+    descriptor_weight: float = 1.0
+    detector_weight: float = 1.0  # of the divergence from the detector of the weights that it starts from
+    stability_weight: float = 1.0  # of the divergence from the stability of the teacher, where one is given
+    stability_every: int = 4  # the teacher looks at every so many views
+    masked_pixels: float = 8.0  # points nearer than this are not each other's negatives
+    compile: bool = False  # let torch fuse the network's operations; needs a C compiler
+    pairs: DevicePairSettings = field(default_factory=DevicePairSettings)
+    optimiser: OptimiserSettings = field(
+        default_factory=lambda: OptimiserSettings(
+            batch_size=64, learning_rate=1e-3, steps=4000, decay_steps=1300, warmup_steps=100, workers=0
+        )
+    )
+    views: ViewSettings = field(
+        default_factory=lambda: ViewSettings(height=240, width=320, smallest_zoom=0.6, rotation_degrees=30.0)
+    )
+    photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
+
+    def __post_init__(self) -> None:
+        if self.views.width % 8 or self.views.height % 8:
+            raise ConfigError("settings `views.width` and `views.height`: must be multiples of 8")
+        if self.optimiser.batch_size % self.pairs.group:
+            raise ConfigError(
+                f"setting `optimiser.batch_size`: {self.optimiser.batch_size} is no multiple of `pairs.group` "
+                f"{self.pairs.group}"
+            )
+        if self.optimiser.workers:
+            raise ConfigError("setting `optimiser.workers`: batches made on the device need 0")
+        if self.stability_every < 1:
+            raise ConfigError("setting `stability_every`: must be at least 1")

@@ -24,7 +24,7 @@ from improvo.training.labels import PointLabels, load_labels, save_labels
 from improvo.training.magic_point import MagicPointStage
 from improvo.training.pairs import PairBatches
 from improvo.training.pictures import Pictures, load_pictures
-from improvo.training.settings import HomographiesSettings, OdometryTrainingSettings, ShapesSettings
+from improvo.training.settings import HeldSettings, HomographiesSettings, OdometryTrainingSettings, ShapesSettings
 from improvo.training.synthetic import ShapeBatches, shape_source
 from improvo.training.trainer import Batches, Stage, Trainer, choose_device
 from improvo.training.widen import widen
@@ -36,7 +36,7 @@ WEIGHTS = "weights.safetensors"
 SETTINGS = "settings.yaml"
 LABELS = "labels.npz"
 STEM_LAYERS = 4  # of the encoder, at full and half resolution
-StageSettings = ShapesSettings | HomographiesSettings | OdometryTrainingSettings
+StageSettings = ShapesSettings | HomographiesSettings | OdometryTrainingSettings | HeldSettings
 LABEL_STORES = "label-stores.json"
 SHAPES = DataSource("procedural shapes", "Apache-2.0", "Drawn by improvo.training.shapes.")
 
@@ -46,8 +46,10 @@ def train_shapes(
 ) -> dict[str, Any]:
     """Stage 1: a detector from drawn shapes alone; returns the last row of metrics."""
     network, parent = _network(settings.architecture, settings.optimiser.seed, start)
-    card = _card(_published(settings.architecture), "shapes", settings, (SHAPES,), parent)
-    return _run(MagicPointStage(network, settings.detector), ShapeBatches(settings), settings, output, card, progress)
+    card = model_card(_published(settings.architecture), "shapes", settings, (SHAPES,), parent)
+    return run_stage(
+        MagicPointStage(network, settings.detector), ShapeBatches(settings), settings, output, card, progress
+    )
 
 
 def train_homographies(
@@ -82,13 +84,13 @@ def train_homographies(
         source, drawn = shape_source(settings.shapes, settings.optimiser.seed, weight)
         pictures = replace(pictures, sources=(*pictures.sources, source))
         labels, data = [*labels, drawn], (*data, SHAPES)
-    card = _card(_published(settings.architecture), "homographies", settings, data, parent)
+    card = model_card(_published(settings.architecture), "homographies", settings, data, parent)
     card.training.update(
         detector_labels=str(detector.name) if detector else "shi-tomasi", pictures=len(pictures),
         pictures_skipped=len(pictures.skipped),
     )  # fmt: skip
     stage = JointStage(network, settings)
-    return _run(stage, PairBatches(pictures, labels, settings), settings, output, card, progress)
+    return run_stage(stage, PairBatches(pictures, labels, settings), settings, output, card, progress)
 
 
 def train_odometry(
@@ -122,7 +124,7 @@ def train_odometry(
     _same_labels(output / LABEL_STORES, sequences)
     parent = load_weights(start)
     architecture = replace(without_dead_channels(parent).architecture, stability=True)
-    network = _started(architecture, settings.optimiser.seed, parent)
+    network = started_network(architecture, settings.optimiser.seed, parent)
     frames = [LabelledFrames(sequence, settings.longer_side, settings.landmarks) for sequence in sequences]
     rehearsed, sources = _rehearsal(pictures, settings, output, progress)
     pairs = TrackedPairs(frames, settings, rehearsed)
@@ -135,7 +137,7 @@ def train_odometry(
     if not data:
         data = tuple(DataSource(name, "not stated") for name in (*(s.name for s in sequences), *sources))
     published = replace(parent.architecture, stability=True)
-    card = _card(published, "odometry", settings, data, start.name)
+    card = model_card(published, "odometry", settings, data, start.name)
     card.training.update(
         stability_trained=True,
         sequences=len(sequences),
@@ -144,7 +146,7 @@ def train_odometry(
         unstable=sum(sequence.record.unstable for sequence in sequences),
     )
     stage = VOAdaptationStage(network, settings, pairs.stable_per_unstable)
-    return _run(stage, pairs, settings, output, replace(card, notes=""), progress)
+    return run_stage(stage, pairs, settings, output, replace(card, notes=""), progress)
 
 
 def _rehearsal(
@@ -170,21 +172,26 @@ def _same_labels(path: Path, sequences: Sequence[LabelledSequence]) -> None:
     files.write_json(path, now)
 
 
-def _run(
+def run_stage(
     stage: Stage,
     batches: Batches,
     settings: StageSettings,
     output: Path,
     card: ModelCard,
     progress: bool,
+    seconds: float = 0.0,
 ) -> dict[str, Any]:
-    """Train, and leave weights, card, metrics and settings in the folder; continues what is already there."""
+    """Train, and leave weights, card, metrics and settings in the folder; continues what is already there.
+
+    Args:
+        seconds: see `Trainer`.
+    """
     files.make_output_folder(output, f"train {card.training['stage']}")
     _same_settings(output / SETTINGS, settings)
-    trainer = Trainer(stage, batches, settings.optimiser, output)
+    trainer = Trainer(stage, batches, settings.optimiser, output, seconds)
     resumed = trainer.resume()
     if resumed and progress:
-        print(f"{output}: continues at step {trainer.step} of {settings.optimiser.steps}")
+        print(f"{output}: continues at step {trainer.step} of {trainer.settings.steps}")
 
     def save(trainer: Trainer) -> None:
         row = json.loads((output / "metrics.jsonl").read_text().splitlines()[-1])
@@ -219,7 +226,7 @@ def _network(name: str, seed: int, start: Path | None, stem: int = 0) -> tuple[S
         architecture = replace(architecture, encoder=(stem,) * STEM_LAYERS + architecture.encoder[STEM_LAYERS:])
     elif weights and _widths(weights.architecture) == _widths(architecture):
         architecture = replace(without_dead_channels(weights).architecture, stability=False)
-    return _started(architecture, seed, weights), start.name if start else ""
+    return started_network(architecture, seed, weights), start.name if start else ""
 
 
 def _published(name: str) -> Architecture:
@@ -229,7 +236,7 @@ def _published(name: str) -> Architecture:
     return replace(ARCHITECTURES[name], stability=False)
 
 
-def _started(architecture: Architecture, seed: int, weights: Weights | None) -> SuperPoint:
+def started_network(architecture: Architecture, seed: int, weights: Weights | None) -> SuperPoint:
     """A network with the given weights, widened where it is wider; what they lack stays random."""
     torch.manual_seed(seed)
     network = SuperPoint(architecture)
@@ -273,7 +280,7 @@ def loaded(weights: Weights) -> SuperPoint:
     return network.eval()
 
 
-def _card(
+def model_card(
     architecture: Architecture,
     stage: str,
     settings: StageSettings,

@@ -6,12 +6,16 @@ killed and continues from its checkpoint ends with the weights of one that was n
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
+import statistics
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -74,16 +78,25 @@ class Trainer:
         batches: the data, by step.
         settings: see `OptimiserSettings`.
         folder: gets `checkpoint.pt` and `metrics.jsonl`.
+        seconds: of training, over all runs; where given, the number of steps follows from it and from how long a step
+            takes, until the learning rate begins to fall. Needs batches without workers.
     """
 
-    def __init__(self, stage: Stage, batches: Batches, settings: OptimiserSettings, folder: Path) -> None:
+    def __init__(
+        self, stage: Stage, batches: Batches, settings: OptimiserSettings, folder: Path, seconds: float = 0.0
+    ) -> None:
         if settings.threads:
             torch.set_num_threads(settings.threads)
         self.device = choose_device(settings.device)
         self.precision = choose_precision(settings.precision, self.device)
         self.stage = stage.to(self.device, memory_format=torch.channels_last)
         self.average = deepcopy(self.stage).requires_grad_(False)
-        self.batches, self.settings, self.folder = batches, settings, folder
+        self.batches, self.settings, self.folder, self.allowed = batches, settings, folder, seconds
+        self._averaged = [
+            (value, self.stage.state_dict()[name])
+            for name, value in self.average.state_dict().items()
+            if value.is_floating_point()
+        ]
         decayed = [p for p in stage.parameters() if p.ndim > 1]
         others = [p for p in stage.parameters() if p.ndim <= 1]
         self.optimiser = torch.optim.AdamW(
@@ -96,6 +109,8 @@ class Trainer:
             distributed.init_process_group("nccl" if self.device.type == "cuda" else "gloo")
         self.step = 0
         self.seconds = 0.0  # of training, over all runs
+        self._warm = False
+        self._recent: deque[float] = deque(maxlen=9)  # seconds of a step, in the last rows of metrics
 
     def resume(self) -> bool:
         """Continue from the folder's checkpoint, if there is one; rows of metrics behind it are dropped.
@@ -112,6 +127,8 @@ class Trainer:
             self.average.load_state_dict(state["average"])
             self.optimiser.load_state_dict(state["optimiser"])
             self.step, self.seconds = int(state["step"]), float(state["seconds"])
+            if self.allowed:
+                self.settings = replace(self.settings, **state["planned"])
         except Exception as error:  # torch raises many kinds; none of them is worth a traceback
             reason = str(error).splitlines()[0]
             raise InputError(f"{path}: cannot be continued from ({reason}); choose a new output folder") from None
@@ -130,6 +147,7 @@ class Trainer:
             "optimiser": self.optimiser.state_dict(),
             "step": self.step,
             "seconds": self.seconds,
+            "planned": {"steps": self.settings.steps, "decay_steps": self.settings.decay_steps},
         }
         with files.written_atomically(self.folder / CHECKPOINT) as temporary:
             try:
@@ -146,38 +164,59 @@ class Trainer:
         Raises:
             DivergedError: the loss is NaN or infinite; the last checkpoint stays.
         """
-        settings = self.settings
         self.stage.train()
         sums: dict[str, Tensor] = {}
         window_start = saved = time.monotonic()
         count, waiting = 0, 0.0
         loader = iter(self._loader())
-        for _ in tqdm(range(self.step, settings.steps), "training", initial=self.step, total=settings.steps,
-                      unit="step", disable=not (progress and self.share.leads)):  # fmt: skip
-            before = time.monotonic()
-            batch = next(loader)
-            waiting += time.monotonic() - before
-            for name, value in self._step(batch).items():
-                sums[name] = sums[name] + value if name in sums else value
-            self.step += 1
-            count += 1
-            if self.step % settings.log_every and self.step < settings.steps:
-                continue
-            now = time.monotonic()
-            row = {name: float(value) / count for name, value in sums.items()}
-            self._stop_if_diverged(row["loss"])
-            self.seconds += now - window_start
-            self._log(row, (now - window_start) / count, waiting / (now - window_start))
-            sums, count, waiting, window_start = {}, 0, 0.0, now
-            if self.share.leads and (now - saved > 60 * settings.checkpoint_minutes or self.step == settings.steps):
-                self.save()
-                saved = now
-                if on_checkpoint:
-                    on_checkpoint(self)
+        bar = tqdm(desc="training", initial=self.step, total=None if self.allowed else self.settings.steps, unit="step",
+                   disable=not (progress and self.share.leads))  # fmt: skip
+        with bar:
+            while self.step < self.settings.steps:
+                before = time.monotonic()
+                batch = next(loader)
+                waiting += time.monotonic() - before
+                for name, value in self._step(batch).items():
+                    sums[name] = sums[name] + value if name in sums else value
+                self.step += 1
+                count += 1
+                bar.update()
+                if self.step % self.settings.log_every and self.step < self.settings.steps:
+                    continue
+                row = {name: float(value) / count for name, value in sums.items()}
+                now = time.monotonic()
+                self._stop_if_diverged(row["loss"])
+                self.seconds += now - window_start
+                self._log(row, (now - window_start) / count, waiting / (now - window_start))
+                self._plan((now - window_start) / count)
+                sums, count, waiting, window_start = {}, 0, 0.0, now
+                last = self.step == self.settings.steps
+                if self.share.leads and (now - saved > 60 * self.settings.checkpoint_minutes or last):
+                    self.save()
+                    saved = now
+                    if on_checkpoint:
+                        on_checkpoint(self)
         if self.share.processes > 1:
             distributed.barrier()  # nobody goes on before the files are written
         network: nn.Module = self.average.network
         return network.eval()
+
+    def _plan(self, step_seconds: float) -> None:
+        """Choose the number of steps anew from the time that is left; a fall of the rate that has begun is kept."""
+        if not self._warm:  # the first steps take as long as the device needs to get ready
+            self._warm = True
+            return
+        self._recent.append(step_seconds)
+        if not self.allowed or self.step > self.settings.steps - self._decay_steps:
+            return
+        usual = statistics.median(self._recent)
+        remaining = max(round((self.allowed - self.seconds) / usual), 1)
+        steps = self.step + max(remaining, self.step // 2)  # not into a fall that should have begun
+        self.settings = replace(self.settings, steps=steps, decay_steps=steps)
+
+    @property
+    def _decay_steps(self) -> int:
+        return max(min(self.settings.decay_steps, self.settings.steps // 3), 1)
 
     def _step(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         settings = self.settings
@@ -211,32 +250,29 @@ class Trainer:
         """Share of the learning rate: linear warm-up, constant, linear fall to zero over the last steps."""
         settings = self.settings
         rising = (step + 1) / max(settings.warmup_steps, 1)
-        falling = (settings.steps - step) / max(min(settings.decay_steps, settings.steps // 3), 1)
+        falling = (settings.steps - step) / self._decay_steps
         return min(1.0, rising, falling)
 
     def _follow(self) -> None:
         """Exponential moving average of weights and batch-norm statistics; young averages follow faster."""
         decay = min(self.settings.ema, (1 + self.step) / (10 + self.step))
-        current = self.stage.state_dict()
         with torch.no_grad():
-            for name, value in self.average.state_dict().items():
-                if value.is_floating_point():
-                    value.lerp_(current[name], 1 - decay)
-                else:
-                    value.copy_(current[name])
+            torch._foreach_lerp_([kept for kept, _ in self._averaged], [now for _, now in self._averaged], 1 - decay)
 
     def _autocast(self) -> AbstractContextManager[None]:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == torch.bfloat16)
 
     def _loader(self) -> Iterator[dict[str, Tensor]]:
         workers = self.settings.workers
+        if self.allowed:
+            return (self.batches[step] for step in itertools.count(self.step))
         return DataLoader(
             self.batches,
             batch_size=None,
             sampler=range(self.step, self.settings.steps),
             num_workers=workers,
             prefetch_factor=4 if workers else None,
-            pin_memory=self.device.type == "cuda",
+            pin_memory=self.device.type == "cuda" and workers > 0,
         )
 
     def _stop_if_diverged(self, loss: float) -> None:

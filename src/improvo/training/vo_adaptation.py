@@ -53,7 +53,7 @@ class VOAdaptationStage(Stage):
             a, b = sample_descriptors(first, points_a), sample_descriptors(second, points_b)
             descriptor = info_nce_loss(
                 a, b, points_a, points_b, batch["valid"], self.log_scale.exp().clamp(max=100), settings.masked_pixels,
-                negative=batch["negative"], across=settings.negatives_across,
+                negative=batch["negative"], group=len(a) if settings.negatives_across else 1,
             )  # fmt: skip
         stability = self._stability(output.stability_logits, batch)
         total = settings.detector_weight * detector + settings.descriptor_weight * descriptor

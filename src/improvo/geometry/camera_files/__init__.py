@@ -5,6 +5,7 @@ read almost gives a trajectory that is many times worse, and nobody knows why.
 """
 
 from improvo.geometry.camera_files.calibration import Calibration, calibration_yaml, from_field_of_view
+from improvo.geometry.camera_files.colmap import colmap_calibration
 from improvo.geometry.camera_files.containers import parse_yaml
 from improvo.geometry.camera_files.loading import camera_of, folder_calibration, load_calibration
 
@@ -12,6 +13,7 @@ __all__ = [
     "Calibration",
     "calibration_yaml",
     "camera_of",
+    "colmap_calibration",
     "folder_calibration",
     "from_field_of_view",
     "load_calibration",

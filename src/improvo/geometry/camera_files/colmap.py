@@ -45,7 +45,7 @@ def from_text(rows: list[list[str]], source: str, wanted: str | None) -> Calibra
             found.append((number, Calibration(source, (1, 1, 0, 0))))
             continue
         values = [float(value) for value in parameters]
-        found.append((number, _camera(model, (int(width), int(height)), values, source)))
+        found.append((number, colmap_calibration(source, model, (int(width), int(height)), values)))
     return _chosen(found, wanted)
 
 
@@ -68,7 +68,7 @@ def from_binary(data: bytes, source: str, wanted: str | None) -> Calibration:
             values = list(struct.unpack_from(f"<{parameters}d", data, offset + 24))
             offset += 24 + 8 * parameters
             if wanted is None or str(camera) == wanted:
-                found.append((str(camera), _camera(name, (width, height), values, source)))
+                found.append((str(camera), colmap_calibration(source, name, (width, height), values)))
             else:
                 found.append((str(camera), Calibration(source, (1, 1, 0, 0))))
     except struct.error:
@@ -84,18 +84,25 @@ def _chosen(found: list[Row], wanted: str | None) -> Calibration:
     return checked(replace(rows[0], alternatives=tuple(rows[1:])))
 
 
-def _camera(model: str, size: tuple[int, int], values: list[float], source: str) -> Calibration:
-    intrinsics, distortion, name = colmap_parameters(model, values)
-    fx, fy, cx, cy = intrinsics
-    return Calibration(source, (fx, fy, cx - 0.5, cy - 0.5), distortion, name, size)
+def colmap_calibration(source: str, model: str, size: tuple[int, int], parameters: list[float]) -> Calibration:
+    """A camera of COLMAP as a calibration.
 
-
-def colmap_parameters(model: str, p: list[float]) -> tuple[Four, tuple[float, ...], str]:
-    """COLMAP's parameters of a model, as intrinsics (its own pixels), distortion and our model name.
+    Args:
+        source: the file, for messages.
+        model: COLMAP's name of the camera model.
+        size: width and height of the images.
+        parameters: in COLMAP's order; its principal point counts from the corner of the top-left pixel.
 
     Raises:
-        ValueError: a model that is not supported, or another count of parameters.
+        ValueError: an unknown model or another number of parameters.
+        InputError: numbers that cannot be.
     """
+    (fx, fy, cx, cy), distortion, name = _parameters(model, parameters)
+    return checked(Calibration(source, (fx, fy, cx - 0.5, cy - 0.5), distortion, name, size))
+
+
+def _parameters(model: str, p: list[float]) -> tuple[Four, tuple[float, ...], str]:
+    """COLMAP's parameters of a model, as intrinsics (its own pixels), distortion and our model name."""
     if model not in MODELS:
         raise ValueError(f"COLMAP model {model} is not supported; known: {', '.join(MODELS)}")
     count = MODELS[model][1]

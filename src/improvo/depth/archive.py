@@ -1,0 +1,132 @@
+"""`depth.zip`: the depth maps of a run in one file.
+
+A stored zip of 16-bit PNGs, `000123.png` for frame_index 123, and `depth.json` with their scale and camera. Any tool
+reads them once unzipped: depth = value / scale, 0 is unknown. Depths are Z in the camera, in the unit of the run (the
+first median depth of its segment is 1).
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from contextlib import AbstractContextManager
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import cv2
+import numpy as np
+
+from improvo.errors import InputError
+from improvo.files import written_atomically
+from improvo.types import Float32, Float64
+
+DEPTH_FILE = "depth.zip"
+_ABOUT = "depth.json"
+_LARGEST = 65535
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # the same maps give the same bytes
+
+
+class DepthWriter:
+    """`with DepthWriter(path, K, size, farthest) as maps: maps.write(frame, depth)`: the file appears at the end.
+
+    Args:
+        path: of the file.
+        K: (3, 3) of the maps.
+        farthest: depth that the largest value stands for; farther pixels become unknown.
+    """
+
+    def __init__(self, path: Path, K: Float64, farthest: float) -> None:
+        self._atomic: AbstractContextManager[Path] = written_atomically(path)
+        self._K = K
+        self.scale = _LARGEST / farthest
+        self._frames: list[int] = []
+
+    def __enter__(self) -> DepthWriter:
+        self._file = zipfile.ZipFile(self._atomic.__enter__(), "w")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                about = {
+                    "unit": "that of the run: the first median depth is 1",
+                    "depth": "value / scale, 0 where unknown; Z in the camera",
+                    "scale": self.scale,
+                    "K": self._K.tolist(),
+                    "frames": self._frames,
+                }
+                self._store(_ABOUT, (json.dumps(about, indent=2) + "\n").encode())
+            self._file.close()
+        except BaseException as failure:
+            self._atomic.__exit__(type(failure), failure, failure.__traceback__)
+            raise
+        self._atomic.__exit__(kind, error, trace)
+
+    def write(self, frame_index: int, depth: Float32) -> None:
+        """Add the map of a frame, (h, w) with 0 where unknown."""
+        values = np.rint(depth.astype(np.float64) * self.scale)
+        values = np.where((values >= 1) & (values <= _LARGEST), values, 0).astype(np.uint16)
+        self._store(f"{frame_index:06d}.png", cv2.imencode(".png", values)[1].tobytes())
+        self._frames.append(frame_index)
+
+    def _store(self, name: str, content: bytes) -> None:
+        self._file.writestr(zipfile.ZipInfo(name, _EPOCH), content)
+
+
+class DepthReader:
+    """Reads `depth.zip` back; a map is decoded when it is asked for.
+
+    Args:
+        path: the file, or the folder of the run.
+
+    Raises:
+        InputError: missing, damaged, or not written by improvo.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path / DEPTH_FILE if path.is_dir() else path
+        about = self._about
+        try:
+            self.frames: list[int] = [int(frame) for frame in about["frames"]]  # frame_index of each map
+            self.scale = float(about["scale"])  # values per unit of depth
+            self.K: Float64 = np.array(about["K"], np.float64).reshape(3, 3)  # of the maps
+        except (KeyError, TypeError, ValueError) as error:
+            raise self._damaged(error) from None
+
+    @cached_property
+    def _about(self) -> dict[str, Any]:
+        content = self._read(_ABOUT)
+        try:
+            return dict(json.loads(content))
+        except ValueError as error:
+            raise self._damaged(error) from None
+
+    def depth(self, frame_index: int) -> Float32:
+        """(h, w) depth of a frame in the unit of the run, 0 where unknown.
+
+        Raises:
+            InputError: there is no map of this frame, or it is damaged.
+        """
+        if frame_index not in self.frames:
+            raise InputError(f"{self.path}: has no depth of frame {frame_index}")
+        content = np.frombuffer(self._read(f"{frame_index:06d}.png"), np.uint8)
+        values = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+        if values is None or values.dtype != np.uint16 or values.ndim != 2:
+            raise self._damaged(f"frame {frame_index} is no 16-bit PNG")
+        return (values / self.scale).astype(np.float32)
+
+    def _read(self, name: str) -> bytes:
+        try:
+            with zipfile.ZipFile(self.path) as file:
+                return file.read(name)
+        except FileNotFoundError:
+            raise InputError(f"{self.path}: no such file; `improvo run --dense` writes it") from None
+        except (OSError, KeyError, zipfile.BadZipFile) as error:
+            raise self._damaged(error) from None
+
+    def _damaged(self, reason: object) -> InputError:
+        return InputError(f"{self.path}: is damaged or not written by improvo ({reason}); run again with --dense")

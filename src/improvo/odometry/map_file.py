@@ -1,0 +1,75 @@
+"""The sparse map as a PLY file, which every 3D viewer opens: written and read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from improvo.errors import InputError
+from improvo.files import written_atomically
+from improvo.types import SparseMap
+
+_FIELDS = (
+    ("x", "<f4", "float"),
+    ("y", "<f4", "float"),
+    ("z", "<f4", "float"),
+    ("observations", "<i4", "int"),
+    ("mean_error", "<f4", "float"),
+    ("segment", "<i4", "int"),
+)
+
+_PLY_TYPES = {"float": "<f4", "double": "<f8", "int": "<i4", "uint": "<u4", "uchar": "u1", "short": "<i2"}
+
+
+def write_map(path: Path, sparse_map: SparseMap) -> None:
+    """Binary PLY, one vertex per map point, up to scale."""
+    rows = np.zeros(len(sparse_map), np.dtype([(name, kind) for name, kind, _ in _FIELDS]))
+    rows["x"], rows["y"], rows["z"] = sparse_map.xyz.T
+    rows["observations"], rows["mean_error"] = sparse_map.observations, sparse_map.mean_error
+    rows["segment"] = sparse_map.segment
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment improvo map, up to scale",
+        f"element vertex {len(rows)}",
+    ]
+    header += [f"property {kind} {name}" for name, _, kind in _FIELDS]
+    with written_atomically(path) as temporary, temporary.open("wb") as file:
+        file.write(("\n".join([*header, "end_header"]) + "\n").encode())
+        file.write(rows.tobytes())
+
+
+def read_map(path: Path) -> SparseMap:
+    """Read the `map.ply` of a run.
+
+    Raises:
+        InputError: missing, damaged, or not written by improvo.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); `improvo run` writes it") from None
+    header, separator, body = content.partition(b"end_header\n")
+    lines = header.decode("ascii", "replace").split("\n")
+    count = next((int(line.split()[2]) for line in lines if line.startswith("element vertex")), -1)
+    properties = [line.split() for line in lines if line.startswith("property")]
+    if not separator or count < 0 or "format binary_little_endian 1.0" not in lines:
+        raise InputError(f"{path}: is no map that improvo wrote; run `improvo run` again")
+    try:
+        dtype = np.dtype([(name, _PLY_TYPES[kind]) for _, kind, name in properties])
+        vertices = np.frombuffer(body, dtype, count)
+        xyz = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        mean_error = vertices["mean_error"].astype(np.float64)
+        return SparseMap(
+            ids=np.arange(count),
+            xyz=xyz,
+            observations=vertices["observations"].astype(np.int64),
+            mean_error=mean_error,
+            max_error=np.full(count, np.nan),
+            segment=vertices["segment"].astype(np.int64),
+        )
+    except (ValueError, KeyError) as error:
+        raise InputError(
+            f"{path}: is damaged or no map that improvo wrote ({error}); run `improvo run` again"
+        ) from None

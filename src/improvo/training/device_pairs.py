@@ -1,0 +1,232 @@
+"""Batches of pairs of views made where the network runs: pictures stay in the device's memory, as do their depths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from improvo.errors import InputError
+from improvo.frontend.architecture import CELL
+from improvo.training.distributed import Share
+from improvo.training.labels import DUSTBIN
+from improvo.training.photometric_batch import augment_batch
+from improvo.training.picture_store import DepthStore, PictureStore, on_device
+from improvo.training.pictures import Pictures
+from improvo.training.posed import PosedSequence, overlapping_pairs
+from improvo.training.random_views import random_views
+from improvo.training.settings import HeldSettings
+from improvo.training.views import inside, warp_points
+from improvo.types import Float64, Int64
+
+# views (V, 1, H, W) in [0, 1] -> logits (V, C, Hc, Wc)
+Teacher = Callable[[Tensor], Tensor]
+_SPREAD = 1.0  # of the random part of a keypoint's score, beside the logarithm of its probability
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """The pairs of one batch: pictures, homographies between them where depth does not relate them, and views."""
+
+    rows: Int64  # (B, 2) pictures a, b of the store
+    scenes: Int64  # (B,) pairs of one scene may show the same places
+    b_from_a: Float64  # (B, 3, 3) between the pictures; of no use for the first `posed` pairs
+    view_from_picture: Float64  # (2B, 3, 3), first the a views
+    posed: int  # so many pairs, the first ones, are related by depth and poses
+
+
+class DevicePairs:
+    """Batch number i, always the same for the same seed on the same device: (2B) images, first the a views.
+
+    A batch has `images` (2B, 1, H, W) uint8, `points_a`, `points_b` (B, N, 2) float32 pixels that show the same place,
+    `valid` (B, N) bool, `scenes` (B,) int64, `detector` (2B, 65, Hc, Wc) the logits that are held to, and, with a
+    teacher of stability, `stability` (2B / every, 2, Hc, Wc).
+
+    Args:
+        pictures: homography pairs are made of these, and of the frames of `posed`.
+        detector: its logits choose keypoints and are held to.
+        stability: likewise, for every `stability_every`-th view.
+    """
+
+    def __init__(
+        self,
+        pictures: Pictures,
+        posed: Sequence[PosedSequence],
+        settings: HeldSettings,
+        detector: Teacher,
+        stability: Teacher | None,
+        device: torch.device,
+    ) -> None:
+        if not pictures.sources and not posed:
+            raise InputError("nothing to train on: give pictures or posed sequences")
+        self.settings, self.device = settings, device
+        self.detector, self.stability = detector, stability
+        self.sources = pictures.sources
+        frames = [picture for sequence in posed for picture in sequence.pictures]
+        singles = [picture for source in pictures.sources for picture in source.pictures]
+        self.store = PictureStore([*frames, *singles], device)
+        self.depths = _depth_store(posed, device)
+        self.first_frame = np.cumsum([0, *(len(sequence.pictures) for sequence in posed)])
+        self.first_picture = len(frames) + np.cumsum([0, *(len(source.pictures) for source in pictures.sources)])
+        self.pairs = [overlapping_pairs(sequence, settings.pairs) for sequence in posed]
+        self.useful = [row for row, pairs in enumerate(self.pairs) if pairs is not None]
+        counts = [len(sequence.pictures) for sequence in posed]
+        K = [np.broadcast_to(s.K, (n, 3, 3)) for s, n in zip(posed, counts, strict=True)]
+        self.K = np.concatenate([np.zeros((0, 3, 3)), *K])
+        self.poses = np.concatenate([np.zeros((0, 4, 4)), *(sequence.world_from_cam for sequence in posed)])
+        self.share = Share.of_this_process()
+
+    def __len__(self) -> int:
+        return self.settings.optimiser.steps
+
+    def __getitem__(self, step: int) -> dict[str, Tensor]:
+        with torch.no_grad():
+            return self._batch(step)
+
+    def _batch(self, step: int) -> dict[str, Tensor]:
+        settings, views = self.settings, self.settings.views
+        rng = np.random.default_rng([settings.optimiser.seed, step, self.share.rank])
+        generator = torch.Generator(self.device).manual_seed(int(rng.integers(2**62)))
+        plan = self._plan(rng, len(self.share.of(settings.optimiser.batch_size)))
+        shown = self.store.views(plan.rows.T.ravel(), plan.view_from_picture, views.width, views.height)
+        images = augment_batch(shown, rng, generator, settings.photometric)
+        network_input = (images.float() / 255).contiguous(memory_format=torch.channels_last)
+        logits = self.detector(network_input)
+        batch = {"images": images, "detector": logits, "scenes": on_device(plan.scenes, self.device)}
+        if self.stability is not None:
+            batch["stability"] = self.stability(network_input[:: settings.stability_every])
+        return {**batch, **self._points(plan, logits[: len(plan.rows)].float(), generator)}
+
+    def _plan(self, rng: np.random.Generator, count: int) -> _Plan:
+        """Which pictures are seen, and from where."""
+        settings = self.settings.pairs
+        share = settings.posed_share if self.sources else 1.0
+        posed = round(share * count) if self.useful else 0
+        rows, scenes = np.zeros((count, 2), np.int64), np.zeros(count, np.int64)
+        b_from_a = np.tile(np.eye(3), (count, 1, 1))
+        centres = np.full((2, count, 2), np.nan)
+        turns = -(-posed // max(len(self.useful), 1))  # every sequence once before any comes again
+        order = [int(scene) for _ in range(turns) for scene in rng.permutation(self.useful)]
+        for pair in range(count):
+            if pair < posed:
+                scene = scenes[pair] = order[pair]
+                pairs = self.pairs[scene]
+                assert pairs is not None
+                a, b, centres[0, pair], centres[1, pair] = pairs.draw(rng)
+                rows[pair] = self.first_frame[scene] + np.array([a, b if settings.two_frames else a])
+            else:
+                source, a, b, b_from_a[pair] = self._picture_pair(rng)
+                scenes[pair] = len(self.pairs) + source
+                rows[pair] = self.first_picture[source] + np.array([a, b])
+        related = posed if settings.two_frames else 0
+        sizes = self.store.sizes[rows].astype(np.float64)
+        H_a = random_views(rng, self.settings.views, sizes[:, 0], centres[0])
+        self._look_there(H_a, b_from_a, rows, sizes, centres[1], related)
+        H_b = random_views(rng, self.settings.views, sizes[:, 1], centres[1])
+        return _Plan(rows, scenes, b_from_a, np.concatenate([H_a, H_b]), related)
+
+    def _picture_pair(self, rng: np.random.Generator) -> tuple[int, int, int, Float64]:
+        """Source, two of its pictures, and the homography between them; mostly one picture twice."""
+        chosen, a = Pictures(self.sources).draw(rng)
+        source, b = self.sources[chosen], a
+        if source.rotating is not None and rng.uniform() < 0.5:
+            b = int(np.clip(a + rng.integers(-8, 9), 0, len(source.pictures) - 1))
+        return chosen, a, b, source.homography(a, b)
+
+    def _look_there(
+        self, H_a: Float64, b_from_a: Float64, rows: Int64, sizes: Float64, centres: Float64, related: int
+    ) -> None:
+        """Let view b of a homography pair look where view a does; a picture that does not show it is replaced by a."""
+        views = self.settings.views
+        middle = np.array([(views.width - 1) / 2, (views.height - 1) / 2])
+        for pair in range(related, len(rows)):
+            here = warp_points(np.linalg.inv(H_a[pair]), middle)
+            there = warp_points(b_from_a[pair], here)
+            if not inside(there, *sizes[pair, 1]):
+                there, rows[pair, 1], b_from_a[pair] = here, rows[pair, 0], np.eye(3)
+                sizes[pair, 1] = sizes[pair, 0]
+            centres[pair] = there
+
+    def _points(self, plan: _Plan, logits: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+        """Keypoints of view a and other points, one candidate of either kind a cell, as far as view b shows them."""
+        settings = self.settings.pairs
+        pairs, _, rows, columns = logits.shape
+        scores, best = logits[:, :DUSTBIN].flatten(2).max(dim=1)
+        scores = scores - torch.logsumexp(logits.flatten(2), dim=1)
+        cells = torch.arange(rows * columns, device=logits.device)
+        corner = torch.stack([cells % columns, cells // columns], dim=-1) * float(CELL)  # (C, 2)
+        keypoints = corner + torch.stack([best % CELL, best // CELL], dim=-1)
+        shape = (pairs, rows * columns, 2)
+        others = corner + CELL * torch.rand(shape, generator=generator, device=logits.device) - 0.5
+        noise = -torch.log(
+            -torch.log(torch.rand(shape, generator=generator, device=logits.device).clamp(1e-9, 1 - 1e-6))
+        )
+        candidates = torch.cat([keypoints, others], dim=1)
+        carried, visible = self._carry(plan, candidates)
+        wanted = round(settings.points * settings.keypoint_share)
+        kept = min(wanted, rows * columns), min(settings.points - wanted, rows * columns)
+        rank = torch.cat([scores + _SPREAD * noise[..., 0], noise[..., 1]], dim=1).masked_fill(~visible, -torch.inf)
+        halves = rank.split(rows * columns, dim=1)
+        chosen = torch.cat(
+            [halves[0].topk(kept[0], dim=1)[1], halves[1].topk(kept[1], dim=1)[1] + rows * columns], dim=1
+        )
+        valid = visible.gather(1, chosen)
+        where = chosen[..., None].expand(-1, -1, 2)
+        points_b = torch.where(valid[..., None], carried.gather(1, where), 0.0)
+        return {"points_a": candidates.gather(1, where), "points_b": points_b, "valid": valid}
+
+    def _carry(self, plan: _Plan, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels of view b (B, N, 2) of pixels of view a, and whether both pictures show the place."""
+        views, count = self.settings.views, len(plan.rows)
+        in_a = _warped(np.asarray(np.linalg.inv(plan.view_from_picture[:count])), points)
+        in_b = _warped(plan.b_from_a, in_a)
+        visible = torch.ones_like(in_a[..., 0], dtype=torch.bool)
+        if plan.posed:
+            in_b[: plan.posed], visible[: plan.posed] = self._through_depth(plan.rows[: plan.posed], in_a[: plan.posed])
+        sizes = on_device(self.store.sizes[plan.rows].astype(np.float32), points.device)
+        visible = visible & _within(in_a, sizes[:, 0]) & _within(in_b, sizes[:, 1])
+        result = _warped(plan.view_from_picture[count:], torch.where(visible[..., None], in_b, 0.0))
+        return result, visible & _within(
+            result, on_device(np.array([[views.width, views.height]], np.float32), points.device)
+        )
+
+    def _through_depth(self, rows: Int64, in_a: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels of frames b of pixels (P, N, 2) of frames a, by depth and poses, and whether nothing hides them."""
+        inverse_K = np.linalg.inv(self.K[rows[:, 0]])
+        b_from_a = np.linalg.inv(self.poses[rows[:, 1]]) @ self.poses[rows[:, 0]]
+        turned = self.K[rows[:, 1]] @ b_from_a[:, :3, :3] @ inverse_K  # pixels of b per pixel of a and unit depth
+        moved = (self.K[rows[:, 1]] @ b_from_a[:, :3, 3:])[..., 0]
+        A, t = (on_device(part, in_a.device) for part in (turned, moved))
+        inverse = self.depths.sample(rows[:, 0], in_a)
+        seen = torch.cat([in_a, torch.ones_like(in_a[..., :1])], dim=-1)
+        seen = (seen[:, :, None] * A[:, None]).sum(dim=-1) + inverse[..., None] * t[:, None]  # over the depth in a
+        ahead = (inverse > 0) & (seen[..., 2] > 1e-3)
+        in_b = torch.where(ahead[..., None], seen[..., :2] / torch.where(ahead, seen[..., 2], 1.0)[..., None], -1.0)
+        expected = inverse / torch.where(ahead, seen[..., 2], 1.0)  # inverse depth in b
+        found = self.depths.sample(rows[:, 1], in_b)
+        agrees = (expected - found).abs() < self.settings.pairs.depth_tolerance * found
+        return in_b, ahead & agrees
+
+
+def _depth_store(posed: Sequence[PosedSequence], device: torch.device) -> DepthStore:
+    maps = [values for sequence in posed for values in sequence.inverse_depth]
+    sizes = [sequence.size for sequence in posed for _ in sequence.inverse_depth]
+    scales = np.array([(w / m.shape[1], h / m.shape[0]) for (w, h), m in zip(sizes, maps, strict=True)]).reshape(-1, 2)
+    return DepthStore(maps, scales, device)
+
+
+def _warped(H: Float64, points: Tensor) -> Tensor:
+    """Pixels (B, N, 2) through homographies (B, 3, 3); far outside at and beyond the horizon."""
+    matrix = on_device(H, points.device)
+    seen = torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
+    seen = (seen[:, :, None] * matrix[:, None]).sum(dim=-1)  # in full precision whatever a product may use
+    depth = seen[..., 2:]
+    return torch.where(depth > 1e-6, seen[..., :2] / depth.clamp(min=1e-6), -1e6)
+
+
+def _within(points: Tensor, sizes: Tensor) -> Tensor:
+    """(B, N) whether points (B, N, 2) lie within images of sizes (B, 2) width, height."""
+    return ((points >= 0) & (points <= sizes[:, None] - 1)).all(dim=-1)

@@ -1,0 +1,66 @@
+"""Descriptors trained on while detector and stability are held to what they were: adaptation without unlearning."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from improvo.frontend.superpoint import SuperPoint, sample_descriptors
+from improvo.training.losses import held_loss, info_nce_loss
+from improvo.training.settings import HeldSettings
+from improvo.training.trainer import Stage
+
+
+class HeldStage(Stage):
+    """InfoNCE on the descriptors of both views of a pair; divergence from the teachers on the other heads."""
+
+    def __init__(self, network: SuperPoint, settings: HeldSettings) -> None:
+        super().__init__()
+        self.network = network
+        self.settings = settings
+        self.log_scale = nn.Parameter(torch.tensor(math.log(20.0)))  # inverse temperature of the InfoNCE loss
+        self._compiled: Any = None
+
+    def losses(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """See `Stage`; `batch` is that of `DevicePairs`."""
+        settings = self.settings
+        if self._compiled is None:  # not before the average was copied from this
+            self._compiled = torch.compile(self._all_heads) if settings.compile else self._all_heads
+        detector_logits, descriptors, stability_logits = self._compiled(batch["images"])
+        with torch.autocast(descriptors.device.type, enabled=False):
+            first, second = functional.normalize(descriptors.float(), dim=1).chunk(2)
+            points_a, points_b = batch["points_a"], batch["points_b"]
+            a, b = sample_descriptors(first, points_a), sample_descriptors(second, points_b)
+            scale = self.log_scale.exp().clamp(max=100)
+            descriptor = info_nce_loss(
+                a, b, points_a, points_b, batch["valid"], scale, settings.masked_pixels,
+                group=math.gcd(settings.pairs.group, len(a)), scenes=batch["scenes"],
+            )  # fmt: skip
+            detector = held_loss(detector_logits, batch["detector"])
+            total = settings.descriptor_weight * descriptor + settings.detector_weight * detector
+            result = {"descriptor": descriptor, "detector": detector}
+            if stability_logits is not None and "stability" in batch:
+                stability = held_loss(stability_logits[:: settings.stability_every], batch["stability"])
+                total = total + settings.stability_weight * stability
+                result["stability"] = stability
+        with torch.no_grad():
+            right = self._recognised(a, b, batch["valid"])
+        correspondences = batch["valid"].sum(dim=1).float().mean()
+        return {"loss": total, **result, "right": right, "scale": scale, "correspondences": correspondences}
+
+    def _all_heads(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        shared = self.network.encode(images)
+        stability = None if self.network.stability is None else self.network.stability(shared)
+        return self.network.detector(shared), self.network.descriptor(shared), stability
+
+    @staticmethod
+    def _recognised(a: Tensor, b: Tensor, valid: Tensor) -> Tensor:
+        """Share of the points of view a whose partner is the nearest of its pair's, for a sixteenth of the pairs."""
+        a, b, valid = a[::16], b[::16], valid[::16]
+        similarity = (a @ b.transpose(1, 2)).masked_fill(~valid[:, None], -2.0)
+        found = similarity.argmax(dim=2) == torch.arange(a.shape[1], device=a.device)
+        return (found & valid).sum() / valid.sum().clamp(min=1)

@@ -1,0 +1,98 @@
+"""Training on from given weights, their detector held: from pictures and posed sequences to a folder with weights."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from improvo.errors import InputError
+from improvo.frontend.channel_pruning import without_dead_channels
+from improvo.frontend.superpoint import SuperPoint
+from improvo.frontend.weights import DataSource, Weights, load_weights
+from improvo.training.device_pairs import DevicePairs, Teacher
+from improvo.training.held import HeldStage
+from improvo.training.pictures import Pictures
+from improvo.training.posed import PosedSequence
+from improvo.training.settings import HeldSettings
+from improvo.training.stages import loaded, model_card, run_stage, started_network
+from improvo.training.trainer import choose_device, choose_precision
+
+
+def train_held(
+    pictures: Pictures,
+    posed: Sequence[PosedSequence],
+    settings: HeldSettings,
+    output: Path,
+    start: Path,
+    stability_from: Path | None = None,
+    data: tuple[DataSource, ...] = (),
+    progress: bool = True,
+    seconds: float = 0.0,
+) -> dict[str, Any]:
+    """Descriptors from homographies and, between the frames of posed sequences, from depth; the last row of metrics.
+
+    Args:
+        start: weights to start from, whose detector is held.
+        stability_from: weights whose stability head is held to; without it the result has no such head.
+        data: what the model card says about the pictures; the sources' names where it is empty.
+        seconds: of preparing and training; where given, the number of steps follows from it.
+    """
+    begun = time.monotonic()
+    parent = load_weights(start)
+    stability = load_weights(stability_from) if stability_from else None
+    if stability and not stability.architecture.stability:
+        raise InputError(f"{stability_from}: has no stability head to hold to; use weights that were adapted to VO")
+    network = _student(parent, stability, settings)
+    device = choose_device(settings.optimiser.device)
+    precision = choose_precision(settings.optimiser.precision, device)
+    batches = DevicePairs(
+        pictures, posed, settings, network_teacher(parent, "detector", device, precision),
+        network_teacher(stability, "stability", device, precision) if stability else None, device,
+    )  # fmt: skip
+    if not data:
+        names = (*(source.name for source in pictures.sources), *(sequence.name for sequence in posed))
+        data = tuple(DataSource(name, "not stated") for name in names)
+    published = replace(parent.architecture, stability=stability is not None)
+    card = model_card(published, "held", settings, data, start.name)
+    card.training.update(
+        stability_trained=stability is not None,
+        stability_from=stability_from.name if stability_from else "",
+        pictures=len(pictures),
+        frames=sum(len(sequence.pictures) for sequence in posed),
+    )
+    card = replace(card, notes="") if stability else card
+    left = max(seconds - (time.monotonic() - begun), 0.1) if seconds else 0.0
+    return run_stage(HeldStage(network, settings), batches, settings, output, card, progress, left)
+
+
+def network_teacher(weights: Weights, head: str, device: torch.device, precision: torch.dtype) -> Teacher:
+    """One head of a network that is not trained, on views (V, 1, H, W): logits (V, C, Hc, Wc)."""
+    network = loaded(without_dead_channels(weights)).requires_grad_(False)
+    network = network.to(device, memory_format=torch.channels_last)
+    chosen = getattr(network, head)
+
+    def look(views: Tensor) -> Tensor:
+        with torch.no_grad(), torch.autocast(device.type, torch.bfloat16, enabled=precision == torch.bfloat16):
+            logits: Tensor = chosen(network.encode(views))
+        return logits.float()
+
+    return look
+
+
+def _student(parent: Weights, stability: Weights | None, settings: HeldSettings) -> SuperPoint:
+    """The parent's network; its stability head, if it gets one, begins as the teacher's where that fits."""
+    narrow = without_dead_channels(parent)
+    architecture = replace(narrow.architecture, stability=stability is not None)
+    network = started_network(architecture, settings.optimiser.seed, parent)
+    if stability and not parent.architecture.stability:
+        own = network.state_dict()
+        head = {name: torch.from_numpy(v) for name, v in stability.tensors.items() if name.startswith("stability.")}
+        if all(own[name].shape == values.shape for name, values in head.items()):
+            network.load_state_dict(head, strict=False)
+    return network

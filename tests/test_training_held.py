@@ -1,0 +1,317 @@
+"""Pairs made on the device, and training with the other heads held."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="training needs the extra `train`")
+
+from posed_room import SIZE, posed_room  # noqa: E402
+
+from improvo.errors import ConfigError, InputError  # noqa: E402
+from improvo.frontend.weights import DataSource, find_weights, load_weights  # noqa: E402
+from improvo.training.device_pairs import DevicePairs  # noqa: E402
+from improvo.training.held_training import train_held  # noqa: E402
+from improvo.training.losses import held_loss, info_nce_loss  # noqa: E402
+from improvo.training.pack import read_pack, write_pack  # noqa: E402
+from improvo.training.photometric_batch import augment_batch  # noqa: E402
+from improvo.training.picture_store import DepthStore, PictureStore  # noqa: E402
+from improvo.training.pictures import Pictures, Source  # noqa: E402
+from improvo.training.posed import overlapping_pairs  # noqa: E402
+from improvo.training.random_views import random_views  # noqa: E402
+from improvo.training.settings import (  # noqa: E402
+    DevicePairSettings,
+    HeldSettings,
+    OptimiserSettings,
+    PhotometricSettings,
+    ViewSettings,
+)
+from improvo.training.trainer import Stage, Trainer  # noqa: E402
+from improvo.training.views import inside, warp_image, warp_points  # noqa: E402
+
+CPU = torch.device("cpu")
+AS_IT_IS = PhotometricSettings(
+    brightness=0, contrast=(1.0, 1.0), gamma=(1.0, 1.0), shade_share=0, vignette_share=0, blur_share=0, motion_share=0,
+    noise=0, speckle=0, jpeg_share=0,
+)  # fmt: skip
+SMALL = HeldSettings(
+    views=ViewSettings(height=96, width=128, smallest_zoom=0.8, largest_zoom=1.2, rotation_degrees=15.0),
+    pairs=DevicePairSettings(points=64, group=2),
+    photometric=AS_IT_IS,
+    optimiser=OptimiserSettings(
+        steps=12, batch_size=4, warmup_steps=2, decay_steps=4, threads=1, workers=0, log_every=2, learning_rate=5e-4,
+        checkpoint_minutes=0.0, precision="float32",
+    ),
+)  # fmt: skip
+
+
+def no_keypoints(views: Any) -> Any:
+    return torch.zeros(len(views), 65, views.shape[2] // 8, views.shape[3] // 8)
+
+
+def photographs(count: int = 5, size: tuple[int, int] = (200, 150)) -> Source:
+    rng = np.random.default_rng(3)
+    pictures = [
+        cv2.resize(rng.integers(0, 255, (size[1] // 6, size[0] // 6), np.uint8), size, interpolation=cv2.INTER_CUBIC)
+        for _ in range(count)
+    ]
+    return Source("photographs", tuple(pictures), ("",) * count, 1.0)
+
+
+def grey_at(image: Any, points: Any) -> Any:
+    return cv2.remap(image.numpy().astype(np.float32), points.numpy()[None], None, cv2.INTER_LINEAR)[0]
+
+
+def test_many_views_at_once_are_views_of_the_picture() -> None:
+    rng, settings = np.random.default_rng(0), ViewSettings()
+    centres = rng.uniform((0, 0), (319, 239), (400, 2))
+    centres[::2] = np.nan
+    found = random_views(rng, settings, np.tile([320.0, 240.0], (400, 1)), centres)
+    places = np.array([[79.5, 59.5], [0.0, 0.0], [159.0, 119.0]])
+    angles = []
+    for H in found:
+        shown = warp_points(np.linalg.inv(H), places)
+        assert np.isfinite(shown).all()
+        assert inside(shown[0], 320, 240)
+        assert np.allclose(warp_points(H, shown), places, atol=1e-6)
+        along = shown[2] - shown[1]
+        angles.append(np.degrees(np.arctan2(along[1], along[0])) - np.degrees(np.arctan2(119, 159)))
+    assert np.abs(angles).max() < 80
+    assert 10 < np.std(angles) < 30
+
+
+def test_views_of_pictures_of_any_size_are_those_of_opencv() -> None:
+    pictures = [*photographs(2).pictures, *photographs(2, (90, 240)).pictures]
+    store = PictureStore(pictures, CPU)
+    rows = np.array([3, 0, 2, 1])
+    rng = np.random.default_rng(1)
+    settings = ViewSettings(height=48, width=64, smallest_zoom=0.6, largest_zoom=1.2)
+    H = random_views(rng, settings, store.sizes[rows].astype(np.float64), np.full((4, 2), np.nan))
+    H[0, :2] += 20 * H[0, 2]  # looks beyond the picture, which is mirrored there
+    views = store.views(rows, H, 64, 48)
+    for view, row, homography in zip(views[:, 0].numpy(), rows, H, strict=True):
+        wanted = warp_image(pictures[row], homography, 64, 48)
+        assert np.abs(view - wanted).mean() < 1.0
+
+
+def test_a_view_from_afar_looks_at_the_halved_picture() -> None:
+    picture = np.indices((120, 160)).sum(axis=0).astype(np.uint8) % 2 * 255  # a board of single pixels
+    view = PictureStore([picture], CPU).views(np.array([0]), np.diag([0.5, 0.5, 1.0])[None], 80, 60)
+    assert np.abs(view.numpy() - 127.5).max() < 2
+
+
+def test_inverse_depth_is_exact_on_planes_and_unknown_at_steps() -> None:
+    room = posed_room(1)
+    values = room.inverse_depth[0]
+    store = DepthStore([values, values], np.array([[4.0, 4.0]] * 2), CPU)
+    points = torch.tensor([[[20.0, 40.0], [20.5, 100.25], [-3.0, 5.0], [500.0, 5.0]]])
+    found = store.sample(np.array([1]), points)[0]
+    rays = np.column_stack([points[0, :2].numpy(), [1, 1]]) @ np.linalg.inv(room.K).T
+    assert np.allclose(found[:2], rays @ np.array([0.15, 0, 1.0]) / 3.0, rtol=1e-4)
+    assert (found[2:] == 0).all()
+    edges = (values == 0).sum()
+    assert 10 < edges < 200  # the outline of the panel alone
+
+
+def test_light_and_sensor_are_the_same_for_the_same_seed() -> None:
+    images = torch.full((6, 1, 48, 64), 100.0)
+
+    def changed(settings: PhotometricSettings) -> Any:
+        return augment_batch(images, np.random.default_rng(1), torch.Generator().manual_seed(2), settings)
+
+    everything = PhotometricSettings(shade_share=1, vignette_share=1, blur_share=0.5, motion_share=0.5, jpeg_share=0.5)
+    assert (changed(AS_IT_IS) == 100).all()
+    first = changed(everything)
+    assert first.dtype == torch.uint8
+    assert torch.equal(first, changed(everything))
+    assert first.float().std() > 5
+
+
+def test_blocks_are_compressed_as_jpeg_does() -> None:
+    picture = photographs(1, (160, 120)).pictures[0]
+    settings = replace(AS_IT_IS, jpeg_share=1.0, jpeg_quality=(30, 31))
+    made = augment_batch(
+        torch.from_numpy(picture)[None, None].float(), np.random.default_rng(0), torch.Generator(), settings
+    )[0, 0].numpy()
+    encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 30])[1]
+    wanted = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE)
+    off = np.abs(wanted.astype(float) - made).mean()
+    assert off < 0.25 * np.abs(wanted.astype(float) - picture).mean()
+
+
+def test_points_of_two_frames_show_the_same_place_and_hidden_ones_do_not_count() -> None:
+    rooms = [posed_room(seed=seed) for seed in range(2)]
+    settings = replace(SMALL, pairs=replace(SMALL.pairs, posed_share=1.0, points=300))
+    batches = DevicePairs(Pictures(()), rooms, settings, no_keypoints, None, CPU)
+    assert len(batches) == 12
+    off = []
+    for step in range(4):
+        batch = batches[step]
+        valid = batch["valid"]
+        assert valid.float().mean() > 0.5
+        for pair in range(4):
+            a = grey_at(batch["images"][pair, 0], batch["points_a"][pair][valid[pair]])
+            b = grey_at(batch["images"][4 + pair, 0], batch["points_b"][pair][valid[pair]])
+            off.append(np.abs(a - b))
+            assert np.corrcoef(a, b)[0, 1] > 0.9
+    off = np.concatenate(off)
+    assert np.median(off) < 4
+    assert (off > 40).mean() < 0.02  # nothing is taken for what stands before it
+    again = batches[3]
+    assert all(torch.equal(batch[name], again[name]) for name in batch)
+    assert not torch.equal(batches[0]["images"], batch["images"])
+
+
+def test_pictures_and_frames_are_mixed_and_the_control_shows_one_frame_twice() -> None:
+    for two_frames in (True, False):
+        settings = replace(SMALL, pairs=replace(SMALL.pairs, two_frames=two_frames))
+        batches = DevicePairs(Pictures((photographs(),)), [posed_room()], settings, no_keypoints, no_keypoints, CPU)
+        batch = batches[0]
+        assert sorted(batch["scenes"].tolist()) == [0, 0, 1, 1]
+        assert len(batch["stability"]) == 2
+        for pair in range(4):
+            valid = batch["valid"][pair]
+            a = grey_at(batch["images"][pair, 0], batch["points_a"][pair][valid])
+            b = grey_at(batch["images"][4 + pair, 0], batch["points_b"][pair][valid])
+            assert np.median(np.abs(a - b)) < 6
+
+
+def test_points_are_taken_at_keypoints_of_the_detector() -> None:
+    def corner_of_each_cell(views: Any) -> Any:
+        logits = no_keypoints(views)
+        logits[:, 3 * 8 + 5] = 9.0
+        return logits
+
+    batches = DevicePairs(Pictures((photographs(),)), [], SMALL, corner_of_each_cell, None, CPU)
+    places = batches[0]["points_a"][:, :32] % 8
+    assert torch.equal(places, torch.tensor([5.0, 3.0]).expand_as(places))
+
+
+def test_frames_that_share_nothing_make_no_pair() -> None:
+    room = posed_room(3)
+    apart = replace(room, world_from_cam=room.world_from_cam + 10 * np.eye(4, k=3) * np.arange(3)[:, None, None])
+    pairs = overlapping_pairs(room, DevicePairSettings())
+    assert pairs is not None
+    assert len(pairs.frames) == 6
+    assert overlapping_pairs(apart, DevicePairSettings()) is None
+    assert overlapping_pairs(room, DevicePairSettings(largest_gap=0.5)) is None
+    with pytest.raises(InputError, match="nothing to train on"):
+        DevicePairs(Pictures(()), [], SMALL, no_keypoints, None, CPU)
+
+
+def test_pairs_of_the_same_scene_are_not_each_others_negatives() -> None:
+    generator = torch.Generator().manual_seed(0)
+    a = torch.nn.functional.normalize(torch.randn(4, 20, 16, generator=generator), dim=2)
+    places = 100 * torch.rand(4, 20, 2, generator=generator)
+    parts = (a, a, places, places, torch.ones(4, 20, dtype=torch.bool), torch.tensor(5.0), 8.0)
+    alone = info_nce_loss(*parts)
+    same = info_nce_loss(*parts, group=2, scenes=torch.tensor([0, 0, 3, 3]))
+    other = info_nce_loss(*parts, group=2, scenes=torch.tensor([0, 1, 3, 4]))
+    assert float(same) == pytest.approx(float(alone))
+    assert float(other) > float(alone) + 0.1
+    assert float(info_nce_loss(*parts, group=2)) == pytest.approx(float(other))
+
+
+def test_what_is_held_costs_nothing_until_it_moves() -> None:
+    logits = torch.randn(2, 65, 3, 4, generator=torch.Generator().manual_seed(0))
+    assert float(held_loss(logits, logits)) == pytest.approx(0.0, abs=1e-6)
+    assert float(held_loss(logits + 7, logits)) == pytest.approx(0.0, abs=1e-5)
+    assert float(held_loss(2 * logits, logits)) > 0.05
+
+
+def test_a_killed_training_ends_with_the_same_weights_and_holds_the_other_heads(tmp_path: Path) -> None:
+    start, teacher = find_weights("superpoint-small"), find_weights("superpoint-vo")
+    arguments = (Pictures((photographs(),)), [posed_room()])
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    row = train_held(*arguments, SMALL, whole, start, teacher, progress=False)
+    step, made = Trainer._step, []
+
+    def dies(self: Any, batch: Any) -> Any:
+        if len(made) == 7:
+            raise KeyboardInterrupt
+        made.append(1)
+        return step(self, batch)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Trainer, "_step", dies)
+        with pytest.raises(KeyboardInterrupt):
+            train_held(*arguments, SMALL, parts, start, teacher, progress=False)
+    train_held(*arguments, SMALL, parts, start, teacher, progress=False)
+    ends = [load_weights(folder / "weights.safetensors") for folder in (whole, parts)]
+    assert all(np.array_equal(ends[0].tensors[name], ends[1].tensors[name]) for name in ends[0].tensors)
+    assert ends[0].architecture.stability
+    assert ends[0].card.training["stability_from"] == "superpoint-vo.safetensors"
+    assert {"descriptor", "detector", "stability", "right"} <= row.keys()
+    with pytest.raises(InputError, match="no stability head"):
+        train_held(*arguments, SMALL, tmp_path / "other", start, start, progress=False)
+
+
+def test_a_training_ends_when_its_time_is_up(tmp_path: Path) -> None:
+    class Still(Stage):
+        def __init__(self) -> None:
+            super().__init__()
+            self.network = torch.nn.Linear(2, 1)
+
+        def losses(self, batch: Any) -> Any:
+            time.sleep(0.004)
+            return {"loss": self.network(batch["x"]).square().mean()}
+
+    class Ones:
+        def __len__(self) -> int:
+            return 10**6
+
+        def __getitem__(self, step: int) -> Any:
+            return {"x": torch.ones(1, 2)}
+
+    settings = replace(SMALL.optimiser, steps=10**6, decay_steps=10**6, log_every=10, checkpoint_minutes=1.0)
+    trainer = Trainer(Still(), Ones(), settings, tmp_path, seconds=2.0)
+    trainer.run(progress=False)
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert 1.0 < trainer.seconds < 4.0
+    assert rows[-1]["step"] == trainer.step < 1000
+    rates = [row["learning_rate"] for row in rows]
+    assert rates[-1] < 0.05 * max(rates)
+    assert (np.diff(rates) <= 1e-12).sum() > len(rates) // 2
+
+
+def test_a_pack_gives_back_what_was_packed(tmp_path: Path) -> None:
+    turning = replace(photographs(3), rotating=np.stack([np.eye(3)] * 3))
+    room, data = posed_room(3), (DataSource("a room", "CC0 1.0", "nobody"),)
+    write_pack(tmp_path / "pack.zip", Pictures((turning, photographs(2))), [room], data, quality=95)
+    pictures, posed, licences = read_pack(tmp_path / "pack.zip")
+    assert licences == data
+    assert [len(source.pictures) for source in pictures.sources] == [3, 2]
+    assert pictures.sources[0].rotating is not None
+    assert pictures.sources[1].rotating is None
+    assert np.abs(pictures.sources[0].pictures[1].astype(float) - turning.pictures[1]).mean() < 3
+    assert posed[0].size == SIZE
+    assert np.array_equal(posed[0].world_from_cam, room.world_from_cam)
+    assert np.allclose(posed[0].inverse_depth[2], room.inverse_depth[2], atol=2e-4)
+    (tmp_path / "other.zip").write_text("no")
+    with pytest.raises(InputError, match="no pack"):
+        read_pack(tmp_path / "other.zip")
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: DevicePairSettings(posed_share=1.5),
+        lambda: DevicePairSettings(points=1),
+        lambda: DevicePairSettings(largest_gap=0.0),
+        lambda: HeldSettings(views=ViewSettings(height=100)),
+        lambda: HeldSettings(optimiser=OptimiserSettings(batch_size=6, workers=0)),
+        lambda: HeldSettings(optimiser=OptimiserSettings(batch_size=8, workers=1)),
+        lambda: HeldSettings(stability_every=0),
+    ],
+)
+def test_settings_out_of_range_are_refused(make: Any) -> None:
+    with pytest.raises(ConfigError):
+        make()
