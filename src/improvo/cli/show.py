@@ -175,7 +175,7 @@ def show_matches(arguments: argparse.Namespace) -> None:
     depth_a = sequence.depth(pair[0])
     rows = [
         paint_matches(
-            load_frontend(name, arguments.max_keypoints),
+            load_frontend(name, arguments.max_keypoints, opencv_defaults=True),
             image_a,
             image_b,
             depth_a,
