@@ -109,7 +109,7 @@ class StabilityFrontend:
         self._next += 1
         features = PlaneFeatures(noise=0.2).features(self._sequence, frame)
         jumping = features.descriptors[:, 0] > 0.15  # about a fifth, the same points in every frame
-        rng = np.random.default_rng(frame.index)
+        rng = np.random.default_rng(frame.source_index)
         keypoints = features.keypoints + rng.uniform(-6, 6, features.keypoints.shape) * jumping[:, None]
         stability = np.where(jumping, 0.001, 1.0).astype(np.float32)
         return Features(keypoints.astype(np.float32), features.descriptors, features.scores, stability)
@@ -140,7 +140,7 @@ def test_table_2_compares_both_variants_on_the_same_features(monkeypatch: pytest
     monkeypatch.setattr("improvo.evaluation.vo.protocol.load_frontend", knowing)
     settings = TrajectorySettings(time_windows=(0.5,))
     sources: Any = [IterableSource()]
-    outcomes, found = evaluate_vo(sources, ["knowing"], 500, OdometrySettings(initialisation="paper"), settings)
+    outcomes, found = evaluate_vo(sources, ["knowing"], 500, OdometrySettings(mode="paper"), settings)
     assert [o.variant for o in outcomes] == [WITHOUT, WITH]
     assert [row["variant"] for row in found["rows"]] == [WITHOUT, WITH]
     errors = [row["relative"][0]["translation_m"]["mean"] for row in found["rows"]]

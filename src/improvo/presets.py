@@ -51,7 +51,7 @@ def _paper_run() -> RunSettings:
     from improvo.stability.settings import LabelSettings, TrustSettings
 
     return RunSettings(
-        odometry=OdometrySettings(initialisation="paper"),
+        odometry=OdometrySettings(mode="paper"),
         labels=LabelSettings(second_opinion=TrustSettings(enabled=False)),
     )
 

@@ -108,13 +108,13 @@ def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     from improvo.cli.evaluate_options import exported_features, loaded_frontends
     from improvo.evaluation.pose.results import results, write_records
     from improvo.evaluation.pose.run import run_pose_protocol
-    from improvo.files import make_output_folder, write_json
+    from improvo.files import check_output_folder, make_output_folder, write_json
     from improvo.jobs.pool import Workers
 
     settings, sources = _settings(arguments)
     output: Path | None = arguments.output
     if output is not None:
-        make_output_folder(output, COMMAND)
+        check_output_folder(output, COMMAND)
     default: list[str] | None = [] if arguments.features else None
     loaded, skipped = loaded_frontends(arguments.frontend, settings.max_keypoints, default)
     exported = exported_features(arguments.features, settings.max_keypoints, one_sequence=len(sources) == 1)
@@ -124,6 +124,8 @@ def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         earlier = read_results(output / "pose.json")
         if earlier.get("request") == json.loads(json.dumps(request)):
             return earlier
+    if output is not None:
+        make_output_folder(output, COMMAND)
     with (
         tempfile.TemporaryDirectory(prefix="improvo-") as temporary,
         Workers(arguments.workers, progress=True) as workers,
@@ -198,7 +200,7 @@ def _export(arguments: argparse.Namespace) -> int:
                 frame = sequence[row]
             except ImprovoError:
                 continue  # its pairs are left out of the evaluation, too
-            with written_atomically(folder / f"{frame.index:06d}.png") as temporary:
+            with written_atomically(folder / f"{frame.source_index:06d}.png") as temporary:
                 cv2.imwrite(str(temporary), frame.image)
             written += 1
     print(f"{written} images in {arguments.export_images}; export features as SEQUENCE/NUMBER.npz beside or elsewhere")

@@ -72,12 +72,12 @@ def run(arguments: argparse.Namespace) -> int | None:
     from improvo.config import to_dict
     from improvo.evaluation.trajectory.protocol import evaluate_trajectory
     from improvo.evaluation.trajectory.tables import trajectory_tables
-    from improvo.files import make_output_folder, write_json, write_text
+    from improvo.files import check_output_folder, make_output_folder, write_json, write_text
 
     command = settings_from(TrajectoryCommandSettings, arguments, TRAJECTORY_FLAGS)
     settings = command.trajectory
     if arguments.output is not None:
-        make_output_folder(arguments.output, COMMAND)
+        check_output_folder(arguments.output, COMMAND)
     estimate, truth, notes = read_pair(arguments.estimate, arguments.truth, command.sequence)
     errors = evaluate_trajectory(estimate, truth, settings, (str(arguments.estimate), str(arguments.truth)))
     result = {
@@ -91,6 +91,7 @@ def run(arguments: argparse.Namespace) -> int | None:
     text = trajectory_tables(result, arguments.estimate.name)
     print(text + "".join(f"\n{note}" for note in notes), end="\n" if notes else "")
     if arguments.output is not None:
+        make_output_folder(arguments.output, COMMAND)
         write_json(arguments.output / "trajectory.json", result)
         write_text(arguments.output / "trajectory.md", text)
     return 0

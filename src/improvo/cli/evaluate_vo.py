@@ -17,7 +17,7 @@ COMMAND = "evaluate vo"
 _FLAGS = {
     **TRAJECTORY_FLAGS,
     "max_keypoints": "max_keypoints",
-    "initialisation": "odometry.initialisation",
+    "mode": "odometry.mode",
     "seed": "odometry.seed",
 }
 
@@ -28,10 +28,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("sequences", nargs="+", type=Path, metavar="SEQUENCE", help="with true poses")
     add_frontend_arguments(parser, defaults.max_keypoints)
     parser.add_argument(
-        "--initialisation",
+        "--mode",
         choices=("robust", "paper"),
         default=argparse.SUPPRESS,
-        help=f"of the odometry (default: {defaults.odometry.initialisation})",
+        help=f"of the odometry (default: {defaults.odometry.mode})",
     )
     add_trajectory_arguments(parser)
     add_run_arguments(parser)
@@ -47,14 +47,14 @@ def run(arguments: argparse.Namespace) -> int | None:
     from improvo.evaluation.sources import Recorded
     from improvo.evaluation.trajectory.tables import vo_tables
     from improvo.evaluation.vo.protocol import evaluate_vo
-    from improvo.files import make_output_folder, write_json, write_text
+    from improvo.files import check_output_folder, make_output_folder, write_json, write_text
     from improvo.jobs.pool import Workers
     from improvo.sequences import write_trajectory
 
     settings = settings_from(VoCommandSettings, arguments, _FLAGS)
     output: Path | None = arguments.output
     if output is not None:
-        make_output_folder(output, COMMAND)
+        check_output_folder(output, COMMAND)
     frontends, _ = loaded_frontends(arguments.frontend, settings.max_keypoints, ["superpoint-vo"])
     sources = [Recorded(str(path), settings.sequence) for path in arguments.sequences]
     with Workers(arguments.workers, progress=True) as workers:
@@ -70,6 +70,7 @@ def run(arguments: argparse.Namespace) -> int | None:
     text = vo_tables(results)
     print(text, end="")
     if output is not None:
+        make_output_folder(output, COMMAND)
         for outcome in outcomes:
             folder = output / f"{outcome.frontend}{outcome.variant}"
             folder.mkdir(exist_ok=True)

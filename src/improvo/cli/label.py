@@ -40,8 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_setting(
         parser,
         defaults,
-        "--max-stray",
-        "odometry.matching.max_stray",
+        "--flow-outlier-limit",
+        "odometry.matching.flow_outlier_limit",
         metavar="SHARE",
         help="end tracks where a link is farther than this share of the image width from the frame's median motion; "
         "0.1 suits video of 10 frames a second and more (default: 0, never, as in the paper)",

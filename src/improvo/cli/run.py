@@ -17,7 +17,7 @@ from improvo.odometry.run_settings import RunSettings
 if TYPE_CHECKING:
     from improvo.odometry.run import RunSummary
     from improvo.odometry.view import View
-    from improvo.odometry.visualizer import Viewer
+    from improvo.odometry.visualizer import Visualizer
     from improvo.sequences import Sequence
 
 _WARNINGS = 5  # printed; run.json has them all
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a video, an image folder or a data set")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
     add_frontend_arguments(parser, defaults)
-    add_setting(parser, defaults, "--mode", "odometry.initialisation", choices=("robust", "paper"))
+    add_setting(parser, defaults, "--mode", "odometry.mode", choices=("robust", "paper"))
     parser.add_argument(
         "--no-stability", action="store_true", help="weigh all observations alike (default: by stability)"
     )
@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 130 if summary.report["interrupted"] else 0
 
 
-def _viewer(arguments: argparse.Namespace) -> Viewer | None:
+def _viewer(arguments: argparse.Namespace) -> Visualizer | None:
     """Rerun where somebody wants to look."""
     if not arguments.view and arguments.save is None:
         return None
@@ -84,7 +84,7 @@ def _viewer(arguments: argparse.Namespace) -> Viewer | None:
     return RerunViewer(arguments.save)
 
 
-def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: Viewer | None) -> RunSummary:
+def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: Visualizer | None) -> RunSummary:
     """The run with its progress."""
     from improvo.odometry.compile import compile_odometry
     from improvo.odometry.run import run_odometry
@@ -97,7 +97,7 @@ def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: View
             shown.note("no pose yet" if view.cam_from_world is None else "")
             shown.advance()
 
-        return run_odometry(sequence, folder, settings, viewer=viewer, progress=told)
+        return run_odometry(sequence, folder, settings, visualizer=viewer, progress=told)
 
 
 def _figures(summary: RunSummary) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def _print_summary(summary: RunSummary) -> None:
         say(f"  segment {segment['number']} starts at frame {segment['first']}: own scale, placed by guess")
     warnings = [event for event in report["events"] if event["kind"] in ("lost", "contradiction")]
     for event in warnings[:_WARNINGS]:
-        say(f"  frame {event['position']}: {event['kind']}: {event['detail']}")
+        say(f"  frame {event['frame_index']}: {event['kind']}: {event['detail']}")
     if len(warnings) > _WARNINGS:
         say(f"  ... {len(warnings) - _WARNINGS} more in run.json")
     skipped = report["input"]["skipped"]
