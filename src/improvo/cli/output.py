@@ -22,7 +22,7 @@ def configure(quiet: bool = False, as_json: bool = False) -> None:
 def say(text: str) -> None:
     """A line about what was done; left out by --quiet and --json."""
     if not _silent:
-        terminal.line(text)
+        _line(text)
 
 
 def next_step(text: str) -> None:
@@ -41,9 +41,20 @@ def figures(data: Any, text: str) -> None:
     if _as_json:
         print(json.dumps(data, indent=2))
     elif text:
-        terminal.line(text)
+        _line(text)
 
 
 def as_json() -> bool:
     """Whether the command was given --json."""
     return _as_json
+
+
+def _line(text: str) -> None:
+    """Print past the progress bars, where there are any."""
+    if "tqdm" not in sys.modules:
+        print(text, flush=True)
+        return
+    from tqdm import tqdm
+
+    with tqdm.external_write_mode():
+        print(text, flush=True)
