@@ -19,7 +19,17 @@ from improvo.cli.commands import COMMANDS
 from improvo.cli.main import main
 
 ROOT = Path(__file__).parents[1]
-PAGES = ("index", "tutorial", "commands", "pictures", "export", "conventions", "paper-to-code", "reference")
+PAGES = (
+    "index",
+    "tutorial",
+    "architecture",
+    "commands",
+    "pictures",
+    "export",
+    "conventions",
+    "paper-to-code",
+    "reference",
+)
 
 
 def text_of(page: str) -> str:
@@ -55,6 +65,15 @@ def test_names_of_modules_and_functions_exist(page: str) -> None:
     assert not missing
     if page in ("paper-to-code", "reference"):
         assert len(names) > 20
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/architecture.md"])
+def test_places_in_the_code_exist(page: str) -> None:
+    text = (ROOT / page).read_text()
+    places = re.findall(r"`([a-z_]+/(?:[\w/]+\.py)?)`", text)
+    assert len(places) > 7
+    for place in places:
+        assert (ROOT / "src" / "improvo" / place).exists() or (ROOT / place).exists(), place
 
 
 @cache
