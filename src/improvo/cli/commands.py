@@ -119,6 +119,11 @@ COMMANDS: dict[str, Command] = {
             ),
         },
     ),
+    "truth": Command(
+        "reference poses and camera of a recording by structure from motion",
+        "truth",
+        "improvo.evaluation.truth.settings:TruthCommandSettings",
+    ),
     "show": Command(
         "the pictures of the paper, from a run, a recording or an evaluation",
         part_name="PICTURE",

@@ -52,8 +52,7 @@ def run(arguments: argparse.Namespace) -> int | None:
     from improvo import __version__
     from improvo.cli.evaluate_options import loaded_frontends
     from improvo.evaluation.homography.pairs import hpatches_scenes, picture_scenes
-    from improvo.evaluation.homography.protocol import run_homography_protocol
-    from improvo.evaluation.tables import homography_table
+    from improvo.evaluation.homography.protocol import homography_table, run_homography_protocol
     from improvo.files import make_output_folder, write_json, write_text
     from improvo.jobs.pool import Workers
 
