@@ -151,6 +151,18 @@ def test_json_is_all_that_is_printed(finished_run: Path, capsys: pytest.CaptureF
     assert "\x1b" not in shown.out + shown.err  # no colours, with or without NO_COLOR
 
 
+def test_commands_that_end_in_figures_print_them_as_json(
+    finished_run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    truth = str(finished_run / "trajectory.txt")
+    assert main(["evaluate", "trajectory", str(finished_run), truth, "-o", str(tmp_path / "out"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["protocol"] == "trajectory"
+    assert main(["evaluate", "trajectory", str(finished_run), truth, "--quiet"]) == 0
+    assert "Absolute trajectory" in capsys.readouterr().out
+    for words, command in leaves():
+        assert ("--json" in help_of(words)) == command.figures
+
+
 def test_progress_is_a_line_now_and_then_where_there_is_no_terminal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -163,12 +175,8 @@ def test_progress_is_a_line_now_and_then_where_there_is_no_terminal(
     assert lines[0].startswith("label: 3 of 4 frames (75 %), ")
     assert lines[0].endswith("left")
     assert lines[1].endswith("; no pose yet")
-    terminal.be_quiet()
-    try:
-        with terminal.progress("label", "frame", 4) as shown:
-            shown.advance(4)
-    finally:
-        terminal.be_quiet(False)
+    with terminal.quiet(), terminal.progress("label", "frame", 4) as shown:
+        shown.advance(4)
     assert capsys.readouterr().err == ""
 
 

@@ -14,10 +14,15 @@ INTERVAL = 20.0  # seconds between two lines, where there is no terminal
 _quiet = False
 
 
-def be_quiet(quiet: bool = True) -> None:
-    """Show no progress from here on, or show it again."""
+@contextmanager
+def quiet(quiet: bool = True) -> Iterator[None]:
+    """Show no progress within; `quiet` False shows it."""
     global _quiet
-    _quiet = quiet
+    before, _quiet = _quiet, quiet
+    try:
+        yield
+    finally:
+        _quiet = before
 
 
 class Progress:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments, add_truth_argument
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.output import figures, next_step, say
 from improvo.errors import ImprovoError, InputError
 from improvo.evaluation.settings import ESTIMATORS, SAMPLINGS, PoseCommandSettings, PoseSettings
 
@@ -86,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int | None:
 
     if arguments.results is not None:
         results = read_results(arguments.results)
-        print(pose_tables(results, arguments.per_sequence), end="")
+        figures(results, pose_tables(results, arguments.per_sequence))
         _draw(results, arguments.results.parent if arguments.output is None else arguments.output)
         return 0
     if not arguments.sequences:
@@ -94,7 +95,9 @@ def run(arguments: argparse.Namespace) -> int | None:
     if arguments.export_images is not None:
         return _export(arguments)
     results = _evaluate(arguments)
-    print(pose_tables(results, arguments.per_sequence), end="")
+    figures(results, pose_tables(results, arguments.per_sequence))
+    if arguments.output is not None:
+        next_step(f"`improvo report {arguments.output}` makes a page of it")
     return 0
 
 
@@ -221,5 +224,5 @@ def _export(arguments: argparse.Namespace) -> int:
             with written_atomically(folder / f"{frame.source_index:06d}.png") as temporary:
                 cv2.imwrite(str(temporary), frame.image)
             written += 1
-    print(f"{written} images in {arguments.export_images}; export features as SEQUENCE/NUMBER.npz beside or elsewhere")
+    say(f"{written} images in {arguments.export_images}; export features as SEQUENCE/NUMBER.npz beside or elsewhere")
     return 0

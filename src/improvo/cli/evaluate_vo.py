@@ -15,6 +15,7 @@ from improvo.cli.evaluate_options import (
 )
 from improvo.cli.evaluate_trajectory import TRAJECTORY_FLAGS, add_trajectory_arguments
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.output import figures, next_step
 from improvo.evaluation.settings import VoCommandSettings
 
 COMMAND = "evaluate vo"
@@ -72,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int | None:
         )
     results = {"protocol": "vo", "improvo": __version__, "settings": to_dict(settings), **found}
     text = vo_tables(results)
-    print(text, end="")
+    figures(results, text)
     if output is not None:
         make_output_folder(output, COMMAND)
         for outcome in outcomes:
@@ -81,4 +82,5 @@ def run(arguments: argparse.Namespace) -> int | None:
             write_trajectory(folder / f"{outcome.sequence}.txt", outcome.trajectory)
         write_json(output / "vo.json", results)
         write_text(output / "vo.md", text)
+        next_step(f"`improvo report {arguments.output}` makes a page of it")
     return 0

@@ -46,7 +46,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="end tracks where a link is farther than this share of the image width from the frame's median motion; "
         "0.1 suits video of 10 frames a second and more (default: 0, never, as in the paper)",
     )
-    parser.add_argument("--json", action="store_true", help="print the records of all sequences as JSON")
     add_frontend_arguments(parser, defaults)
     add_sequence_arguments(parser)
     add_config_arguments(parser)
