@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from improvo.sequences.sequence import Sequence
 
 _PUBLIC = {
-    "open_sequence": "opening",
-    "open_recording": "opening",
-    "Sequence": "sequence",
-    "SequenceSettings": "base",
-    "Recording": "base",
-    "SkippedFrame": "base",
-    "read_trajectory": "trajectory_files",
-    "write_trajectory": "trajectory_files",
+    "open_sequence": "sequences.opening",
+    "open_recording": "sequences.opening",
+    "Sequence": "sequences.sequence",
+    "SequenceSettings": "sequences.base",
+    "Recording": "sequences.base",
+    "SkippedFrame": "sequences.base",
+    "read_trajectory": "geometry.trajectory_files",
+    "write_trajectory": "geometry.trajectory_files",
 }
 
 __all__ = [
@@ -41,5 +41,5 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import public names when they are first used, so that importing the room costs nothing."""
     if name in _PUBLIC:
-        return getattr(importlib.import_module(f"{__name__}.{_PUBLIC[name]}"), name)
+        return getattr(importlib.import_module(f"improvo.{_PUBLIC[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
