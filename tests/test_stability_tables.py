@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from improvo.errors import InputError, OutputError
-from improvo.labeling import tables
+from improvo.stability import tables
 from improvo.stability.rule import IGNORE, STABLE, UNSTABLE, TrackLabels
 
 
@@ -24,7 +24,7 @@ def some_labels(count: int = 5) -> TrackLabels:
         max_error=rng.uniform(3, 9, count),
         stability=np.array([IGNORE, UNSTABLE, STABLE] * count, np.int8)[:count],
         parallax_deg=rng.uniform(0, 5, count),
-        distrusted=np.zeros(count, np.bool_),
+        withheld=np.zeros(count, np.bool_),
         errors=rng.uniform(0, 9, 20),
     )
 
