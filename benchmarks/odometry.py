@@ -87,7 +87,7 @@ def runs(folder: Path, frontend_name: str, modes: list[str], seeds: int, max_key
     assert truth is not None
     for mode in modes:
         for seed in range(seeds if mode == "robust" else 1):  # the mode `paper` draws no random numbers
-            settings = OdometrySettings(initialisation=mode, seed=seed)
+            settings = OdometrySettings(mode=mode, seed=seed)
             start = time.perf_counter()
             odometry = VisualOdometry(frontend, sequence.camera, settings)
             track(odometry, detected)

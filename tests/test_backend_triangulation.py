@@ -164,7 +164,7 @@ def test_kernels_compile_ahead_of_time():
 def test_kernels_work_where_nothing_can_be_cached(monkeypatch):
     from numba import njit
 
-    from improvo.backend import compiled as module
+    from improvo import compiled as module
 
     def no_writable_folder(**options):
         if options.pop("cache", False):

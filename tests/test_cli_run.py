@@ -83,7 +83,7 @@ def test_paper_mode_and_settings_reach_the_odometry(walk: Path, tmp_path: Path) 
     words = ["--initialisation", "paper", "--max-frames", "6", "--set", "odometry.window.paper_poses=4", "--seed", "3"]
     assert main(["run", str(walk), "-o", str(out), "--frontend", "orb", "--max-keypoints", "200", *words]) == 0
     configuration = json.loads((out / "run.json").read_text())["configuration"]
-    assert configuration["odometry"]["initialisation"] == "paper"
+    assert configuration["odometry"]["mode"] == "paper"
     assert configuration["odometry"]["window"]["paper_poses"] == 4
     assert configuration["odometry"]["seed"] == 3
 

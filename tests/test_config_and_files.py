@@ -48,6 +48,34 @@ def test_what_is_printed_is_read_back(tmp_path: Path) -> None:
     assert config.load(Outer, path) == settings
 
 
+def test_settings_under_their_former_names_are_read(tmp_path: Path) -> None:
+    from improvo.odometry.run_settings import RunSettings
+    from improvo.odometry.settings import OdometrySettings
+
+    path = tmp_path / "settings.yaml"
+    path.write_text(
+        "odometry:\n  initialisation: paper\n  trust:\n    least_stability: 0.25\n"
+        "  matching:\n    max_stray: 0.1\n  window:\n    constants: 7\n"
+    )
+    odometry = config.load(RunSettings, path, ["odometry.health.young_frames=9"]).odometry
+    assert (odometry.mode, odometry.ransac_gate.least_stability) == ("paper", 0.25)
+    assert (odometry.matching.flow_outlier_limit, odometry.window.fixed) == (0.1, 7)
+    assert odometry.health.provisional_frames == 9
+    assert config.load(RunSettings, path, ["odometry.mode=robust"]).odometry.mode == "robust"
+    assert config.from_dict(OdometrySettings, {"initialisation": "paper"}).mode == "paper"
+
+
+def test_every_former_name_leads_to_a_setting() -> None:
+    from improvo.odometry.settings import OdometrySettings
+
+    now = {"odometry": config.to_dict(OdometrySettings())}
+    now |= {name: value for name, value in now["odometry"].items() if isinstance(value, dict)}
+    for section, names in config.FORMER_NAMES.items():
+        for former, present in names.items():
+            assert present in now[section]
+            assert former not in now[section]
+
+
 @pytest.mark.parametrize(
     ("override", "said"),
     [

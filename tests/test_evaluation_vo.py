@@ -141,7 +141,7 @@ def test_table_2_compares_both_variants_on_the_same_features(monkeypatch: pytest
     monkeypatch.setattr(vo, "load_odometry_frontend", knowing)
     settings = TrajectorySettings(time_windows=(0.5,))
     sources: Any = [IterableSource()]
-    outcomes, found = evaluate_vo(sources, ["knowing"], 500, OdometrySettings(initialisation="paper"), settings)
+    outcomes, found = evaluate_vo(sources, ["knowing"], 500, OdometrySettings(mode="paper"), settings)
     assert [o.variant for o in outcomes] == [WITHOUT, WITH]
     assert [row["variant"] for row in found["rows"]] == [WITHOUT, WITH]
     errors = [row["relative"][0]["translation_m"]["mean"] for row in found["rows"]]

@@ -23,7 +23,7 @@ def alarms(estimate: Float64, truth: Float64) -> list[int]:
         features = observe(world, true, seed=position)
         nothing = np.full(len(features), -1, np.int64)
         view = View(
-            position=position,
+            frame_index=position,
             time=position / 30.0,
             keypoints=features.keypoints.astype(np.float64),
             descriptors=unit_descriptors(features),

@@ -12,7 +12,7 @@ from simulated_features import CAMERA, hand_motion, nothing_to_see, observe, roo
 from improvo.geometry import se3
 from improvo.geometry.alignment import align_points
 from improvo.odometry.journal import FinalView
-from improvo.odometry.settings import OdometrySettings, TrustSettings
+from improvo.odometry.settings import OdometrySettings, RansacGateSettings
 from improvo.odometry.view import View
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.types import Features, Float64
@@ -65,7 +65,7 @@ def test_robust_mode_recovers_a_walk_in_one_segment(
     trajectory = odometry.trajectory
     assert trajectory.valid.all()
     assert set(trajectory.segment) == {0}
-    assert error_percent(trajectory.positions, truth[:, :3, 3]) < 0.5
+    assert error_percent(trajectory.camera_centers, truth[:, :3, 3]) < 0.5
     assert len(odometry.map) > 300
     assert np.median(odometry.map.mean_error) < 1.0
 
@@ -76,7 +76,7 @@ def test_world_is_the_first_camera_and_its_median_depth_about_one(
     odometry, final = walked
     first = odometry.trajectory.world_from_cam[0]
     np.testing.assert_allclose(first, np.eye(4), atol=0.02)
-    of_first = next(view for view in final if view.position == 0)
+    of_first = next(view for view in final if view.frame_index == 0)
     xyz = dict(zip(odometry.map.ids.tolist(), odometry.map.xyz, strict=True))
     depths = [xyz[point][2] for point in of_first.points.tolist() if point in xyz]
     assert np.median(depths) == pytest.approx(1.0, abs=0.1)
@@ -84,19 +84,19 @@ def test_world_is_the_first_camera_and_its_median_depth_about_one(
 
 def test_every_frame_becomes_final_exactly_once(walked: tuple[VisualOdometry, list[FinalView]]) -> None:
     _, final = walked
-    assert sorted(view.position for view in final) == list(range(90))
+    assert sorted(view.frame_index for view in final) == list(range(90))
 
 
 def test_final_poses_are_the_ones_of_the_trajectory(walked: tuple[VisualOdometry, list[FinalView]]) -> None:
     odometry, final = walked
     for view in final:
-        np.testing.assert_array_equal(view.world_from_cam, odometry.trajectory.world_from_cam[view.position])
+        np.testing.assert_array_equal(view.world_from_cam, odometry.trajectory.world_from_cam[view.frame_index])
 
 
 def test_poses_become_final_while_the_sequence_runs(walk: tuple[Float64, list[Features]]) -> None:
     features = walk[1] + views(hand_motion(200)[90:])
     emitted: list[int] = []
-    odometry = VisualOdometry(_NoFrontend(), CAMERA, on_final=lambda view: emitted.append(view.position))
+    odometry = VisualOdometry(_NoFrontend(), CAMERA, on_final=lambda view: emitted.append(view.frame_index))
     for i, each in enumerate(features[:170]):
         odometry.track_features(each, i / 30.0)
     assert len(emitted) > 20, "nothing became final before the end"
@@ -112,10 +112,10 @@ def test_same_input_and_seed_give_the_same_bytes(
 
 def test_paper_mode_tracks_and_keeps_its_window(walk: tuple[Float64, list[Features]]) -> None:
     truth, features = walk
-    odometry, final = track(features[:45], OdometrySettings(initialisation="paper"))
+    odometry, final = track(features[:45], OdometrySettings(mode="paper"))
     assert odometry.trajectory.valid.all()
-    assert [view.position for view in final] == list(range(45))
-    assert error_percent(odometry.trajectory.positions, truth[:45, :3, 3]) < 40.0
+    assert [view.frame_index for view in final] == list(range(45))
+    assert error_percent(odometry.trajectory.camera_centers, truth[:45, :3, 3]) < 40.0
 
 
 def test_pure_rotation_never_starts_a_map_and_says_why() -> None:
@@ -123,7 +123,7 @@ def test_pure_rotation_never_starts_a_map_and_says_why() -> None:
     world_from_cam[:, :3, 3] = world_from_cam[0, :3, 3]
     odometry, _ = track(views(world_from_cam))
     assert not odometry.trajectory.valid.any()
-    assert any(event.kind == "waiting" and "parallax" in event.detail for event in odometry.events)
+    assert any(event.kind == "initialising" and "parallax" in event.detail for event in odometry.events)
 
 
 def test_a_still_camera_never_starts_a_map() -> None:
@@ -138,7 +138,7 @@ def test_waiting_frames_get_their_pose_once_the_camera_moves() -> None:
     truth = np.concatenate([still, world_from_cam])
     odometry, _ = track(views(truth))
     assert odometry.trajectory.valid.all()
-    assert error_percent(odometry.trajectory.positions, truth[:, :3, 3]) < 0.7
+    assert error_percent(odometry.trajectory.camera_centers, truth[:, :3, 3]) < 0.7
 
 
 def test_a_short_blackout_is_bridged_within_the_segment(walk: tuple[Float64, list[Features]]) -> None:
@@ -149,7 +149,7 @@ def test_a_short_blackout_is_bridged_within_the_segment(walk: tuple[Float64, lis
     assert np.flatnonzero(~trajectory.valid).tolist() == [60, 61, 62, 63]
     assert set(trajectory.segment[trajectory.valid]) == {0}
     rows = trajectory.valid
-    assert error_percent(trajectory.positions[rows], truth[rows, :3, 3]) < 0.7
+    assert error_percent(trajectory.camera_centers[rows], truth[rows, :3, 3]) < 0.7
     assert sum(event.kind == "lost" for event in odometry.events) == 4
 
 
@@ -165,7 +165,7 @@ def test_a_cut_to_another_place_ends_the_segment_and_starts_another() -> None:
     assert any(event.kind == "segment" for event in odometry.events)
     for number, truth, offset in ((0, here, 0), (1, there, 50)):
         rows = np.flatnonzero(trajectory.segment == number)
-        assert error_percent(trajectory.positions[rows], truth[rows - offset, :3, 3]) < 1.0
+        assert error_percent(trajectory.camera_centers[rows], truth[rows - offset, :3, 3]) < 1.0
 
 
 def test_frames_without_any_keypoint_are_lost_not_fatal(walk: tuple[Float64, list[Features]]) -> None:
@@ -187,10 +187,11 @@ def test_a_crowd_that_fills_the_picture_does_not_become_the_world_where_stabilit
     def error(settings: OdometrySettings) -> float:
         trajectory = track(features, settings)[0].trajectory
         assert trajectory.valid.all()
-        return error_percent(trajectory.positions, truth[:, :3, 3])
+        return error_percent(trajectory.camera_centers, truth[:, :3, 3])
 
     assert error(OdometrySettings()) < 1.0
-    assert error(OdometrySettings(trust=TrustSettings(least_stability=0.0))) > 5.0, "the weights alone are enough"
+    no_gate = OdometrySettings(ransac_gate=RansacGateSettings(least_stability=0.0))
+    assert error(no_gate) > 5.0, "the weights alone are enough"
 
 
 def _together(first: Features, second: Features, stability: tuple[float, float]) -> Features:

@@ -167,12 +167,12 @@ def test_a_good_run_has_no_warnings() -> None:
 
 def test_what_is_wrong_is_said_in_plain_words() -> None:
     lost = {"processed": 10, "tracked": 7, "lost": 3, "lost_frames": [4, 5, 6]}
-    event = {"position": 4, "kind": "lost", "detail": "only 3 points of the map found"}
+    event = {"frame_index": 4, "kind": "lost", "detail": "only 3 points of the map found"}
     text = words(report(frames=lost, events=[event]))
     assert "Lost at frame 4" in text
     assert "3 of 10 frames have no pose: 4-6" in text
     none = {"processed": 10, "tracked": 0, "lost": 10, "lost_frames": list(range(10))}
-    waiting = {"position": 2, "kind": "waiting", "detail": "too little parallax"}
+    waiting = {"frame_index": 2, "kind": "initialising", "detail": "too little parallax"}
     assert "too little parallax" in words(report(frames=none, events=[waiting]))
     assert "Dark frames (mean grey value under 25 of 255): 0" in words(report(), brightness=9.0)
     assert "2 pieces" in words(report(segments=[{"first": 0}, {"first": 6}]))

@@ -71,7 +71,7 @@ def test_truth_between_stamps_is_interpolated(tmp_path: Path) -> None:
     )
     truth = open_sequence(tmp_path).ground_truth
     assert isinstance(truth, Trajectory)
-    np.testing.assert_allclose(truth.positions[:, 0], [0, 0.5, 1], atol=1e-9)
+    np.testing.assert_allclose(truth.camera_centers[:, 0], [0, 0.5, 1], atol=1e-9)
     np.testing.assert_allclose(np.arctan2(truth.world_from_cam[:, 1, 0], truth.world_from_cam[:, 0, 0]), [0, 0.2, 0.4])
 
 
@@ -147,7 +147,7 @@ def test_selection_keeps_recording_indices_and_times(tmp_path: Path) -> None:
     assert (sequence[1].image == images(COUNT)[3]).all()
     np.testing.assert_array_equal(sequence.depth(1), depths(COUNT)[3])
     assert sequence.ground_truth is not None
-    np.testing.assert_allclose(sequence.ground_truth.positions, poses(COUNT)[[1, 3], :3, 3], atol=1e-9)
+    np.testing.assert_allclose(sequence.ground_truth.camera_centers, poses(COUNT)[[1, 3], :3, 3], atol=1e-9)
     assert [sequence.row(frame) for frame in sequence] == [0, 1]
 
 

@@ -61,4 +61,4 @@ def test_training_pictures_have_truth_by_frame_number(shared_data: Path) -> None
     assert sequence.ground_truth is not None
     first = np.flatnonzero(sequence.ground_truth.valid)[0]
     assert first == 1  # the file starts at t = 0.033333, which is frame 1
-    np.testing.assert_allclose(sequence.ground_truth.positions[1], [0.0004725, -0.0089707, -2.5])
+    np.testing.assert_allclose(sequence.ground_truth.camera_centers[1], [0.0004725, -0.0089707, -2.5])

@@ -75,7 +75,7 @@ def test_bad_rows_are_counted_and_named(tmp_path: Path) -> None:
     read, problems = read_trajectory_report(file)
     assert read.times.tolist() == [0, 1, 2, 3, 4, 5]
     assert read.valid.tolist() == [True, False, False, False, True, True]
-    assert read.positions[4].tolist() == [1, 0, 0]
+    assert read.camera_centers[4].tolist() == [1, 0, 0]
     report = "\n".join(problems)
     assert "1 rows without a pose: NaN or infinite (line 3)" in report
     assert "2 rows without a pose: not a rigid motion (lines 4, 5)" in report

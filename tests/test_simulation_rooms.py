@@ -159,7 +159,7 @@ def test_the_bundled_sequence_is_small_long_and_lively() -> None:
     assert len(sequence) >= 120
     assert truth is not None
     assert truth.valid.all()
-    assert np.linalg.norm(np.diff(truth.positions, axis=0), axis=1).sum() > 1.5
+    assert np.linalg.norm(np.diff(truth.camera_centers, axis=0), axis=1).sum() > 1.5
     causes = [cv2.imread(str(folder / "labels" / f"{i:06d}.png"), cv2.IMREAD_GRAYSCALE) for i in range(0, 140, 10)]
     assert np.mean([(image == 1).mean() for image in causes]) > 0.02
     assert sequence.depth(0) is not None

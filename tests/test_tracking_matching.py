@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from improvo.tracking.connect import TrackChain
-from improvo.tracking.matching import distance_threshold, mutual_nearest_neighbours, without_strays
+from improvo.tracking.matching import distance_threshold, mutual_nearest_neighbours, without_flow_outliers
 from improvo.types import Features
 
 
@@ -84,6 +84,6 @@ def test_links_far_from_what_all_others_do_are_dropped() -> None:
     matches = np.stack([np.arange(50), rng.permutation(50)], axis=1)
     shuffled = np.empty_like(b)
     shuffled[matches[:, 1]] = b
-    kept = without_strays(matches, a, shuffled, limit=32.0)
+    kept = without_flow_outliers(matches, a, shuffled, limit=32.0)
     assert sorted(set(range(50)) - set(kept[:, 0].tolist())) == [4, 17]
-    assert len(without_strays(matches[:0], a, shuffled, limit=32.0)) == 0
+    assert len(without_flow_outliers(matches[:0], a, shuffled, limit=32.0)) == 0

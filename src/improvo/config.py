@@ -13,6 +13,20 @@ from improvo.errors import ConfigError
 
 T = TypeVar("T")
 
+# Settings that were renamed: the section, what a setting there was called, and what it is called now. Files that were
+# written under a former name stay readable.
+FORMER_NAMES: dict[str, dict[str, str]] = {
+    "odometry": {"initialisation": "mode", "trust": "ransac_gate"},
+    "matching": {
+        "max_stray": "flow_outlier_limit",
+        "refind_radius": "search_radius",
+        "refind_frames": "search_frames",
+    },
+    "start": {"max_waiting": "max_buffered", "max_patience": "max_cooldown"},
+    "window": {"constants": "fixed"},
+    "health": {"young_frames": "provisional_frames"},
+}
+
 
 def to_dict(settings: Any) -> dict[str, Any]:
     """The settings as plain nested dictionaries, tuples as lists, ready for YAML or JSON."""
@@ -41,6 +55,7 @@ def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = ()) 
     """
     import yaml
 
+    section = _section_of(cls)
     merged: dict[str, Any] = {}
     if path is not None:
         try:
@@ -52,19 +67,20 @@ def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = ()) 
             ) from None
         if not isinstance(loaded, dict):
             raise ConfigError(f"{path}: must hold `key: value` pairs; `improvo config` prints a valid file")
-        merged = loaded
+        merged = with_present_names(loaded, section)
     for override in overrides:
         name, separator, text = override.partition("=")
         if not separator:
             raise ConfigError(f"--set {override}: write it as section.name=value")
-        target = merged
+        target, below = merged, section
         *sections, leaf = name.strip().split(".")
-        for section in sections:
-            target = target.setdefault(section, {})
+        for part in sections:
+            below = _present_name(below, part)
+            target = target.setdefault(below, {})
             if not isinstance(target, dict):
-                raise ConfigError(f"--set {override}: {section} is a value, not a section")
+                raise ConfigError(f"--set {override}: {part} is a value, not a section")
         try:
-            target[leaf] = yaml.safe_load(text)
+            target[_present_name(below, leaf)] = yaml.safe_load(text)
         except yaml.YAMLError:
             raise ConfigError(f"--set {override}: the value is not readable") from None
     return from_dict(cls, merged, where=str(path) if path else "settings")
@@ -79,6 +95,7 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings") -> 
     import cattrs
     from cattrs.errors import ClassValidationError
 
+    values = with_present_names(values, _section_of(cls))
     _refuse_unknown_keys(cls, values, where, prefix="")
     if all(_has_default(field) for field in dataclasses.fields(cls)):  # type: ignore[arg-type]
         # a section given in part keeps what this class has for the rest of it, not the section's own defaults
@@ -94,6 +111,32 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings") -> 
         raise ConfigError(f"{where}: {_first_reason(error)}") from None
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{where}: {error}") from None
+
+
+def with_present_names(values: Any, section: str = "") -> Any:
+    """Nested dictionaries of settings with every former name replaced by the present one (see FORMER_NAMES).
+
+    Args:
+        values: of one section, or of several as nested dictionaries.
+        section: the name of the section that `values` is; empty for settings that are made of sections.
+    """
+    if not isinstance(values, dict):
+        return values
+    renamed = {}
+    for key, value in values.items():
+        present = _present_name(section, key)
+        if present == key or present not in values:
+            renamed[present] = with_present_names(value, present)
+    return renamed
+
+
+def _present_name(section: str, key: Any) -> Any:
+    return FORMER_NAMES.get(section, {}).get(key, key)
+
+
+def _section_of(cls: type) -> str:
+    """`odometry` for `OdometrySettings`."""
+    return cls.__name__.removesuffix("Settings").lower()
 
 
 def first_difference(before: Any, now: Any, prefix: str = "") -> str:

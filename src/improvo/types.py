@@ -93,8 +93,8 @@ class Trajectory:
         return np.asarray(np.isfinite(self.world_from_cam).all(axis=(1, 2)))
 
     @property
-    def positions(self) -> Float64:
-        """(N, 3) camera centres in the world."""
+    def camera_centers(self) -> Float64:
+        """(N, 3) camera centers in the world."""
         return self.world_from_cam[:, :3, 3]
 
 

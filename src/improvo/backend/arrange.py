@@ -32,15 +32,15 @@ class Constants(NamedTuple):
 
 
 class Observations(NamedTuple):
-    """Observations sorted by point; within a point the free cameras first, in rising order, then the constant ones."""
+    """Observations sorted by point; within a point the free cameras first, in rising order, then the fixed ones."""
 
     order: Int64  # (O,) row in the caller's problem
     camera: Int64  # (O,) row of the poses
-    free_camera: Int64  # (O,) number among the free cameras, or their count for a constant camera
+    free_camera: Int64  # (O,) number among the free cameras, or their count for a fixed camera
     keypoints: Float64  # (O, 2) pixels
     weights: Float64  # (O,)
     first: Int64  # (M + 1,) the observations of point j are first[j]:first[j + 1]
-    first_constant: Int64  # (M,) and those from here on are by constant cameras
+    first_fixed: Int64  # (M,) and those from here on are by fixed cameras
     first_of_camera: Int64  # (O,) the first observation of this point by this camera: itself, unless it saw it twice
     run_end: Int64  # (O,) end of the consecutive cameras, within a chunk, that start here
     point_order: Int64  # (M,) the points by the first free camera that saw them: neighbours share cached rows
@@ -79,10 +79,10 @@ def arrange(problem: BundleProblem, objective: ObjectiveSettings) -> tuple[Const
     free_number[camera_of_free] = np.arange(free)
     camera_index = np.ascontiguousarray(problem.camera_index, np.int64)
     point_index = np.ascontiguousarray(problem.point_index, np.int64)
-    order, first, first_constant = _sort(free_number[camera_index], point_index, free, len(problem.points))
+    order, first, first_fixed = _sort(free_number[camera_index], point_index, free, len(problem.points))
     free_camera = free_number[camera_index[order]]
-    first_of_camera, run_end = _find_runs(free_camera, first, first_constant)
-    first_camera = np.append(free_camera, free)[np.where(first_constant > first[:-1], first[:-1], len(order))]
+    first_of_camera, run_end = _find_runs(free_camera, first, first_fixed)
+    first_camera = np.append(free_camera, free)[np.where(first_fixed > first[:-1], first[:-1], len(order))]
     observations = Observations(
         order,
         camera_index[order],
@@ -90,7 +90,7 @@ def arrange(problem: BundleProblem, objective: ObjectiveSettings) -> tuple[Const
         np.ascontiguousarray(problem.keypoints[order], np.float64),
         np.ascontiguousarray(problem.weights[order], np.float64),
         first,
-        first_constant,
+        first_fixed,
         first_of_camera,
         run_end,
         np.argsort(first_camera, kind="stable"),
@@ -100,7 +100,7 @@ def arrange(problem: BundleProblem, objective: ObjectiveSettings) -> tuple[Const
     return (
         constants,
         observations,
-        _allocate(len(order), len(problem.points), free, int((first_constant - first[:-1]).max(initial=0))),
+        _allocate(len(order), len(problem.points), free, int((first_fixed - first[:-1]).max(initial=0))),
     )
 
 
@@ -130,7 +130,7 @@ def _aligned(count: int) -> Float64:
 
 @compiled
 def _sort(free_camera, point, free, points):  # type: ignore[no-untyped-def]
-    """Counting sort by camera, then a stable one by point: `order`, `first` and `first_constant` of `Observations`."""
+    """Counting sort by camera, then a stable one by point: `order`, `first` and `first_fixed` of `Observations`."""
     observations = len(point)
     by_camera = np.empty(observations, np.int64)
     slot = np.zeros(free + 2, np.int64)
@@ -149,26 +149,26 @@ def _sort(free_camera, point, free, points):  # type: ignore[no-untyped-def]
         first[j + 1] += first[j]
     order = np.empty(observations, np.int64)
     slot = first[:points].copy()
-    first_constant = first[:points].copy()
+    first_fixed = first[:points].copy()
     for k in range(observations):
         row = by_camera[k]
         j = point[row]
         order[slot[j]] = row
         slot[j] += 1
         if free_camera[row] < free:
-            first_constant[j] += 1
-    return order, first, first_constant
+            first_fixed[j] += 1
+    return order, first, first_fixed
 
 
 @compiled
-def _find_runs(free_camera, first, first_constant):  # type: ignore[no-untyped-def]
+def _find_runs(free_camera, first, first_fixed):  # type: ignore[no-untyped-def]
     """`first_of_camera` and `run_end` of `Observations`."""
     first_of_camera, run_end = np.arange(len(free_camera)), np.arange(1, len(free_camera) + 1)
-    for j in range(len(first_constant)):
-        for k in range(first[j] + 1, first_constant[j]):
+    for j in range(len(first_fixed)):
+        for k in range(first[j] + 1, first_fixed[j]):
             if free_camera[k] == free_camera[k - 1]:
                 first_of_camera[k] = first_of_camera[k - 1]
-        for k in range(first_constant[j] - 2, first[j] - 1, -1):
+        for k in range(first_fixed[j] - 2, first[j] - 1, -1):
             if free_camera[k + 1] == free_camera[k] + 1 and free_camera[k + 1] % CHUNK != 0:
                 run_end[k] = run_end[k + 1]
     return first_of_camera, run_end

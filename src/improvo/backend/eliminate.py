@@ -26,7 +26,7 @@ def eliminate(observations, system, damping, min_diagonal):
             continue
         if not _invert_root(system, j, damping, min_diagonal):
             return False
-        first, last = observations.first[j], observations.first_constant[j]
+        first, last = observations.first[j], observations.first_fixed[j]
         for a in range(first, last):
             _couple(observations, system, j, a, a - first)
         for a in range(first, last):
@@ -170,7 +170,7 @@ def back_substitute(observations, system):
             step[0] = step[1] = step[2] = 0.0
             continue
         g0, g1, g2 = system.point_gradient[j, 0], system.point_gradient[j, 1], system.point_gradient[j, 2]
-        for o in range(observations.first[j], observations.first_constant[j]):
+        for o in range(observations.first[j], observations.first_fixed[j]):
             x, y, z = system.in_camera[o, 0], system.in_camera[o, 1], system.in_camera[o, 2]
             camera_step, coupling = system.camera_step[observations.free_camera[o]], system.coupling[o]
             d0 = camera_step[0] + camera_step[4] * z - camera_step[5] * y

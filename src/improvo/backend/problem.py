@@ -25,8 +25,8 @@ class BundleProblem:
     keypoints: Float64  # (O, 2) pixels
     weights: Float64  # (O,) w_ij in [0, 1]
     K: Float64  # (3, 3)
-    fixed_cameras: NDArray[np.bool_]  # (N,) poses kept as constants; their observations count
-    fixed_points: NDArray[np.bool_] | None = None  # (M,) points kept as constants; None: all are free
+    fixed_cameras: NDArray[np.bool_]  # (N,) poses that stay as they are; their observations count
+    fixed_points: NDArray[np.bool_] | None = None  # (M,) points that stay as they are; None: all are free
 
     def __post_init__(self) -> None:
         cameras, points, observations = len(self.cam_from_world), len(self.points), len(self.camera_index)

@@ -17,7 +17,7 @@ COMMAND = "evaluate vo"
 _FLAGS = {
     **TRAJECTORY_FLAGS,
     "max_keypoints": "max_keypoints",
-    "initialisation": "odometry.initialisation",
+    "initialisation": "odometry.mode",
     "seed": "odometry.seed",
 }
 
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--initialisation",
         choices=("robust", "paper"),
         default=argparse.SUPPRESS,
-        help=f"of the odometry (default: {defaults.odometry.initialisation})",
+        help=f"of the odometry (default: {defaults.odometry.mode})",
     )
     add_trajectory_arguments(parser)
     add_run_arguments(parser)

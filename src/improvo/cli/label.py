@@ -53,7 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Label what is not labelled yet; 0 unless nothing could be."""
-    settings = settings_from(LabelRunSettings, arguments, FRONTEND_FLAGS | {"max_stray": "odometry.matching.max_stray"})
+    settings = settings_from(
+        LabelRunSettings, arguments, FRONTEND_FLAGS | {"max_stray": "odometry.matching.flow_outlier_limit"}
+    )
     from tqdm import tqdm
 
     from improvo.labeling.label_sequences import label_sequences

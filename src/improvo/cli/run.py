@@ -19,10 +19,10 @@ from improvo.odometry.run_settings import RunSettings
 if TYPE_CHECKING:
     from improvo.odometry.run import RunSummary
     from improvo.odometry.view import View
-    from improvo.odometry.visualizer import Viewer
+    from improvo.odometry.visualizer import Visualizer
     from improvo.sequences import Sequence
 
-_FLAGS = {**FRONTEND_FLAGS, "initialisation": "odometry.initialisation"}
+_FLAGS = {**FRONTEND_FLAGS, "initialisation": "odometry.mode"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 130 if summary.report["interrupted"] else 0
 
 
-def _viewer(arguments: argparse.Namespace) -> Viewer | None:
+def _viewer(arguments: argparse.Namespace) -> Visualizer | None:
     """Rerun where somebody wants to look."""
     if not arguments.view and arguments.save is None:
         return None
@@ -84,7 +84,7 @@ def _viewer(arguments: argparse.Namespace) -> Viewer | None:
     return RerunViewer(arguments.save)
 
 
-def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: Viewer | None) -> RunSummary:
+def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: Visualizer | None) -> RunSummary:
     """The run with its progress line."""
     from tqdm import tqdm
 
@@ -98,7 +98,7 @@ def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: View
             bar.set_postfix_str("no pose yet" if view.cam_from_world is None else "", refresh=False)
             bar.update()
 
-        return run_odometry(sequence, folder, settings, viewer=viewer, progress=progress)
+        return run_odometry(sequence, folder, settings, visualizer=viewer, progress=progress)
 
 
 def _print_summary(summary: RunSummary) -> None:
@@ -112,7 +112,7 @@ def _print_summary(summary: RunSummary) -> None:
         print(f"  segment {segment['number']} starts at frame {segment['first']}: own scale, placed by guess")
     warnings = [event for event in report["events"] if event["kind"] in ("lost", "contradiction")]
     for event in warnings[:5]:
-        print(f"  frame {event['position']}: {event['kind']}: {event['detail']}")
+        print(f"  frame {event['frame_index']}: {event['kind']}: {event['detail']}")
     if len(warnings) > 5:
         print(f"  ... {len(warnings) - 5} more in run.json")
     skipped = report["input"]["skipped"]

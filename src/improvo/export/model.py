@@ -49,7 +49,7 @@ def segment_model(run: RunFolder, segment: int, max_error: float = 4.0, min_obse
         min_observations: points with fewer remaining ones are left out.
     """
     rows = np.flatnonzero(run.trajectory.segment == segment)
-    frames = run.positions[rows]
+    frames = run.frame_indices[rows]
     cam_from_world = se3.inverse(run.trajectory.world_from_cam[rows])
     row_of_frame = np.full(run.frames, -1, np.int64)
     row_of_frame[frames] = np.arange(len(frames))

@@ -116,7 +116,7 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
         raise InputError(f"{job.path}: no frame got a pose: {_last_reason(report)}")
 
     points, tracks = read_points(job.folder / POINTS_FILE), read_tracks(job.folder / TRACKS_FILE)
-    contradictions = [event["position"] for event in report["events"] if event["kind"] == "contradiction"]
+    contradictions = [event["frame_index"] for event in report["events"] if event["kind"] == "contradiction"]
     has_pose = summary.trajectory.valid
     trust = judge_frames(
         tracks,
@@ -214,7 +214,7 @@ def _notes(report: dict[str, Any], trust: dict[str, int]) -> str:
     if skipped := report["input"]["skipped"]:
         notes.append(f"{len(skipped)} unreadable (first: frame {skipped[0]['index']}, {skipped[0]['reason']})")
     if lost := report["frames"]["lost_frames"]:
-        why = {event["position"]: event["detail"] for event in report["events"]}
+        why = {event["frame_index"]: event["detail"] for event in report["events"]}
         notes.append(f"{len(lost)} without a pose (first: frame {lost[0]}, {why.get(lost[0], _last_reason(report))})")
     if len(report["segments"]) > 1:
         starts = ", ".join(str(segment["first"]) for segment in report["segments"][1:])

@@ -17,7 +17,7 @@ from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.odometry.local_map import poselib_camera
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.view import View, trusted_pairs
+from improvo.odometry.view import View, ransac_pairs
 from improvo.tracking.matching import match_units
 from improvo.types import Float64, Int64
 
@@ -51,17 +51,17 @@ class HealthCheck:
 
         Args:
             view: the newest view with a pose.
-            earlier: recent views with poses by position.
+            earlier: recent views with poses by frame index.
         """
         settings = self._settings.health
-        if view.position % settings.interval:
+        if view.frame_index % settings.interval:
             return False
         counts = np.zeros((len(settings.gaps), 2), np.int64)
         for row, gap in enumerate(settings.gaps):
-            if view.position - gap not in earlier:
+            if view.frame_index - gap not in earlier:
                 continue
             found = agreement(
-                earlier[view.position - gap], view, self._camera, self._descriptor_distance, self._settings
+                earlier[view.frame_index - gap], view, self._camera, self._descriptor_distance, self._settings
             )
             if found.own_inliers >= max(settings.min_inliers, settings.min_inlier_share * found.matches):
                 counts[row] = found.map_inliers, found.own_inliers
@@ -85,7 +85,7 @@ def agreement(a: View, b: View, camera: Camera, descriptor_distance: float, sett
     if len(matches) < 8:
         return Agreement(0, 0, len(matches))
     pixels_a, pixels_b = a.keypoints[matches[:, 0]], b.keypoints[matches[:, 1]]
-    used = trusted_pairs(a, b, matches, settings.trust)
+    used = ransac_pairs(a, b, matches, settings.ransac_gate)
     limit = settings.health.epipolar_error
     shape = poselib_camera(camera)
     own, report = poselib.estimate_relative_pose(

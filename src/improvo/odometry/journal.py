@@ -20,7 +20,7 @@ from improvo.types import Float64, Int64, SparseMap, Trajectory
 class FinalView:
     """A frame that nothing can change any more."""
 
-    position: int  # in the processed sequence
+    frame_index: int  # in the processed sequence
     time: float  # seconds
     segment: int  # -1 without a pose
     world_from_cam: Float64  # (4, 4), NaN without a pose
@@ -46,7 +46,7 @@ class Segment:
 class Event:
     """Something the user should know about a frame."""
 
-    position: int
+    frame_index: int
     kind: str
     detail: str
 
@@ -95,7 +95,7 @@ class Journal:
         self._last_pose = np.eye(4)  # world_from_cam of the last final view
         self._last_depth = 1.0  # median depth there, in the world's unit
         self._errors: list[float] = []
-        self._positions: list[int] = []
+        self._frame_indices: list[int] = []
         self._last_refusal = ""
         self.segments: list[Segment] = []
         self.events: list[Event] = []
@@ -115,7 +115,7 @@ class Journal:
     def refused(self, view: View, reason: str) -> None:
         """The map cannot start yet."""
         if reason != self._last_refusal:
-            self._note(view, "waiting", reason)
+            self._note(view, "initialising", reason)
             self._last_refusal = reason
 
     def lost(self, view: View, inliers: int) -> None:
@@ -150,7 +150,7 @@ class Journal:
         self._last_pose = world_from_cam
         if len(points_cam):
             self._last_depth = float(np.median(points_cam[:, 2])) * self._placement.scale
-        self._positions.append(view.position)
+        self._frame_indices.append(view.frame_index)
         self._emit(view, world_from_cam, len(self.segments))
 
     def ended(self, local_map: LocalMap, reason: str) -> None:
@@ -174,14 +174,14 @@ class Journal:
         self.segments.append(
             Segment(
                 number=len(self.segments),
-                first=min(self._positions),
-                last=max(self._positions),
-                frames=len(self._positions),
+                first=min(self._frame_indices),
+                last=max(self._frame_indices),
+                frames=len(self._frame_indices),
                 mean_error=float(np.nanmean(errors)) if np.isfinite(errors).any() else 0.0,
                 reason=reason,
             )
         )
-        self._errors, self._positions = [], []
+        self._errors, self._frame_indices = [], []
 
     @property
     def trajectory(self) -> Trajectory:
@@ -205,12 +205,12 @@ class Journal:
         )
 
     def _emit(self, view: View, world_from_cam: Float64, segment: int) -> None:
-        self._poses[view.position] = (view.time, world_from_cam, segment)
+        self._poses[view.frame_index] = (view.time, world_from_cam, segment)
         if self._on_final is None:
             return
         self._on_final(
             FinalView(
-                position=view.position,
+                frame_index=view.frame_index,
                 time=view.time,
                 segment=segment,
                 world_from_cam=world_from_cam,
@@ -222,4 +222,4 @@ class Journal:
         )
 
     def _note(self, view: View, kind: str, detail: str) -> None:
-        self.events.append(Event(view.position, kind, detail))
+        self.events.append(Event(view.frame_index, kind, detail))

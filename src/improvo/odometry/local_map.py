@@ -13,7 +13,7 @@ from improvo.geometry.camera import Camera
 from improvo.geometry.triangulation import triangulate_tracks
 from improvo.odometry.projection_search import match_by_projection
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_points, trusted
+from improvo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_points, ransac_rows
 from improvo.tracking.matching import match_units
 from improvo.types import Float32, Float64, Int64
 
@@ -30,14 +30,14 @@ class LocalMap:
     def __init__(self, camera: Camera, settings: OdometrySettings, descriptor_distance: float) -> None:
         self.camera = camera
         self.store = PointStore()
-        self.history: deque[View] = deque(maxlen=settings.matching.refind_frames)  # in order of processing
+        self.history: deque[View] = deque(maxlen=settings.matching.search_frames)  # in order of processing
         self._settings = settings
         self._descriptor_distance = descriptor_distance
-        self._refind_radius = max(3.0, settings.matching.refind_radius * camera.width / 640.0)
+        self._search_radius = max(3.0, settings.matching.search_radius * camera.width / 640.0)
 
     def remember(self, view: View) -> None:
         """The view is processed: its points were seen last in it."""
-        self.store.last_seen[view.points[view.observed]] = view.position
+        self.store.last_seen[view.points[view.observed]] = view.frame_index
         self.history.append(view)
 
     def localise(self, view: View, neighbour: View) -> tuple[int, float]:
@@ -58,7 +58,7 @@ class LocalMap:
                 view.cam_from_world = None
                 view.points[:] = NO_POINT
                 return inliers, share
-        self._find_lost_points(view)
+        self._search_by_projection(view)
         return inliers, share
 
     def _is_lost(self, inliers: int, share: float) -> bool:
@@ -78,7 +78,7 @@ class LocalMap:
         if len(rows) < 4:
             return 0, 0.0
         max_error = self._settings.window.max_error
-        used = trusted(view.weights[rows], self._settings.trust)
+        used = ransac_rows(view.weights[rows], self._settings.ransac_gate)
         pose, report = poselib.estimate_absolute_pose(
             view.keypoints[rows[used]],
             self.store.xyz[view.points[rows[used]]],
@@ -101,10 +101,10 @@ class LocalMap:
         view.points[rows[~fits]] = NO_POINT
         return int(inliers.sum()), float(inliers.mean())
 
-    def _find_lost_points(self, view: View) -> None:
+    def _search_by_projection(self, view: View) -> None:
         """Points of the last frames that should be visible take a free keypoint near their projection."""
         assert view.cam_from_world is not None
-        ids, descriptors = self._lost_points(view)
+        ids, descriptors = self._points_to_search(view)
         projections, inside = self.project(view.cam_from_world, self.store.xyz[ids])
         free = np.flatnonzero(view.points < 0)
         pairs = match_by_projection(
@@ -112,12 +112,12 @@ class LocalMap:
             descriptors[inside],
             view.keypoints[free],
             view.descriptors[free],
-            self._refind_radius,
+            self._search_radius,
             self._descriptor_distance,
         )
         view.points[free[pairs[:, 1]]] = ids[inside][pairs[:, 0]]
 
-    def _lost_points(self, view: View) -> tuple[Int64, Float32]:
+    def _points_to_search(self, view: View) -> tuple[Int64, Float32]:
         """Ids (L,) of recently seen points that `view` does not observe, with their last descriptors (L, D)."""
         ids, descriptors = [np.zeros(0, np.int64)], [view.descriptors[:0]]
         last_seen = self.store.last_seen
@@ -126,7 +126,7 @@ class LocalMap:
         for earlier in self.history:
             rows = earlier.observed
             points = earlier.points[rows]
-            lost = (last_seen[points] == earlier.position) & ~seen_now[points]
+            lost = (last_seen[points] == earlier.frame_index) & ~seen_now[points]
             ids.append(points[lost])
             descriptors.append(earlier.descriptors[rows[lost]])
         return np.concatenate(ids), np.concatenate(descriptors)
@@ -164,7 +164,7 @@ class LocalMap:
             & (worst <= self._settings.window.max_error)
         )
         ids = np.full(len(counts), NO_POINT)
-        ids[good] = self.store.add(result.points[good], view.position)
+        ids[good] = self.store.add(result.points[good], view.frame_index)
         point = np.repeat(ids, counts)
         for i, v in enumerate(views):
             of_view = (camera == i) & (point >= 0)

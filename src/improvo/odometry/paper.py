@@ -60,7 +60,7 @@ class PaperMapper:
             max_error=None,
         )
         self._journal.tracked(report)
-        if self._health.contradicts(view, {earlier.position: earlier for earlier in self._window}):
+        if self._health.contradicts(view, {earlier.frame_index: earlier for earlier in self._window}):
             self._journal.contradicted(view, "the mode `paper` goes on all the same")
         if len(self._window) > self._settings.window.paper_poses:
             self._journal.finalise(self._window.pop(0), self._map)
@@ -84,7 +84,7 @@ class PaperMapper:
         assert view.cam_from_world is not None
         new = view.points < 0
         xyz: Float64 = self._camera.unproject(view.keypoints[new], 1.0)
-        view.points[new] = self._map.store.add(se3.transform(se3.inverse(view.cam_from_world), xyz), view.position)
+        view.points[new] = self._map.store.add(se3.transform(se3.inverse(view.cam_from_world), xyz), view.frame_index)
 
     def _end_segment(self, reason: str) -> None:
         if self._map is None:

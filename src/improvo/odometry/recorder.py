@@ -58,7 +58,7 @@ class TrackRecorder:
 
     def add(self, view: FinalView) -> None:
         """A frame became final (in any order)."""
-        self._pending[view.position] = view
+        self._pending[view.frame_index] = view
         if len(self._pending) >= _FLUSH_EVERY:
             self._flush()
 
@@ -83,8 +83,8 @@ class TrackRecorder:
 
     def _take(self, view: FinalView) -> None:
         pose = se3.inverse(view.world_from_cam) if view.segment >= 0 else np.full((4, 4), np.nan)
-        self._poses[view.position] = (pose, view.segment)
-        frame = np.full(len(view.tracks), view.position)
+        self._poses[view.frame_index] = (pose, view.segment)
+        frame = np.full(len(view.tracks), view.frame_index)
         new = _Rows(frame, view.tracks, view.keypoints, view.weights, view.points)
         self._rest = new if self._rest is None else self._rest.followed_by(new)
 

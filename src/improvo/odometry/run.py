@@ -28,7 +28,7 @@ from improvo.odometry.recorder import TrackRecorder
 from improvo.odometry.run_settings import RunSettings
 from improvo.odometry.view import View
 from improvo.odometry.visual_odometry import VisualOdometry
-from improvo.odometry.visualizer import NullViewer, Viewer
+from improvo.odometry.visualizer import NullVisualizer, Visualizer
 from improvo.sequences import Sequence, write_trajectory
 from improvo.types import Trajectory
 
@@ -55,7 +55,7 @@ def run_odometry(
     settings: RunSettings,
     command: str = "run",
     frontend: Frontend | None = None,
-    viewer: Viewer | None = None,
+    visualizer: Visualizer | None = None,
     progress: Callable[[View], None] | None = None,
 ) -> RunSummary:
     """Track a sequence and write its trajectory, map, tracks and report into `folder`.
@@ -67,7 +67,7 @@ def run_odometry(
         folder: made if need be; must be empty or one that `command` made.
         settings: all of them; `settings.sequence` is only recorded.
         frontend: in place of the one that the settings name.
-        viewer: is shown every frame.
+        visualizer: is shown every frame.
         progress: is called after every frame.
 
     Raises:
@@ -77,7 +77,7 @@ def run_odometry(
     frontend = frontend or load_odometry_frontend(
         settings.frontend.name, settings.frontend.max_keypoints, settings.frontend.least_stability
     )
-    viewer = viewer or NullViewer()
+    visualizer = visualizer or NullVisualizer()
     if sequence.length is not None and sequence.length < _MIN_FRAMES:
         raise InputError(f"{sequence.path}: has {sequence.length} frames; odometry needs at least {_MIN_FRAMES}")
     make_output_folder(folder, command)
@@ -87,10 +87,10 @@ def run_odometry(
         odometry = VisualOdometry(
             frontend, sequence.camera, settings.odometry, settings.frontend.use_stability, on_final=recorder.add
         )
-        viewer.begin(sequence.camera)
-        processed, interrupted = _track_all(sequence, frontend, odometry, viewer, progress, seconds)
+        visualizer.begin(sequence.camera)
+        processed, interrupted = _track_all(sequence, frontend, odometry, visualizer, progress, seconds)
         odometry.finish()
-        viewer.end()
+        visualizer.end()
         if len(processed) < _MIN_FRAMES and not interrupted:
             raise InputError(f"{sequence.path}: only {len(processed)} of its frames can be read; check the recording")
     trajectory = odometry.trajectory
@@ -106,7 +106,7 @@ def _track_all(
     sequence: Sequence,
     frontend: Frontend,
     odometry: VisualOdometry,
-    viewer: Viewer,
+    visualizer: Visualizer,
     progress: Callable[[View], None] | None,
     seconds: defaultdict[str, float],
 ) -> tuple[list[int], bool]:
@@ -122,7 +122,7 @@ def _track_all(
                 seconds["detect"] += detected.detecting
                 seconds["match"] += detected.matching
                 processed.append(detected.frame.index)
-                viewer.show(detected.frame, view, odometry.running_points)
+                visualizer.show(detected.frame, view, odometry.running_points)
                 if progress is not None:
                     progress(view)
     except KeyboardInterrupt:

@@ -19,6 +19,7 @@ from improvo.stability.rule import IGNORE
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
 from improvo.types import Float64, Int64, SparseMap, Trajectory, UInt8
 
+_FORMER_KINDS = {"waiting": "initialising"}  # of events
 _PLY_TYPES = {"float": "<f4", "double": "<f8", "int": "<i4", "uint": "<u4", "uchar": "u1", "short": "<i2"}
 
 
@@ -53,7 +54,7 @@ class RunFolder:
         if not path.is_dir():
             raise InputError(f"{path}: no such folder; give the output folder of `improvo run`")
         try:
-            self.report: dict[str, Any] = json.loads((path / "run.json").read_text())
+            self.report = _with_present_names(json.loads((path / "run.json").read_text()))
             self._recorded_input = Path(self.report["input"]["path"])
             self.source_index: list[int] = self.report["frames"]["source_index"]
         except FileNotFoundError:
@@ -68,7 +69,7 @@ class RunFolder:
 
     @property
     def frames(self) -> int:
-        """Number of processed frames; a frame's position is 0 to this."""
+        """Number of processed frames; a `frame_index` is 0 to this, exclusive."""
         return len(self.source_index)
 
     @cached_property
@@ -84,15 +85,16 @@ class RunFolder:
         return read_trajectory(self.path / "trajectory.txt")
 
     @cached_property
-    def positions(self) -> Int64:
-        """(N,) the position in the processed sequence of each row of `trajectory`."""
+    def frame_indices(self) -> Int64:
+        """(N,) the `frame_index` of each row of `trajectory`."""
         lost = set(self.report["frames"]["lost_frames"])
-        positions = np.array([p for p in range(self.frames) if p not in lost], np.int64)
-        if len(positions) != len(self.trajectory):
+        frame_indices = np.array([p for p in range(self.frames) if p not in lost], np.int64)
+        if len(frame_indices) != len(self.trajectory):
             raise InputError(
-                f"{self.path}: trajectory.txt has {len(self.trajectory)} poses, run.json {len(positions)}; run again"
+                f"{self.path}: trajectory.txt has {len(self.trajectory)} poses and run.json {len(frame_indices)}; "
+                "run again"
             )
-        return positions
+        return frame_indices
 
     @cached_property
     def map(self) -> SparseMap:
@@ -125,17 +127,19 @@ class RunFolder:
     def _row_of_index(self) -> dict[int, int]:
         return {int(index): row for row, index in enumerate(self.sequence.indices)}
 
-    def image(self, position: int) -> UInt8:
+    def image(self, frame_index: int) -> UInt8:
         """The grey image (H, W) of a processed frame.
 
         Raises:
             InputError: there is no such frame in the run or in the recording.
         """
-        if not 0 <= position < self.frames:
-            raise InputError(f"{self.path}: has no frame {position}; frames are 0 to {self.frames - 1}")
-        row = self._row_of_index.get(self.source_index[position])
+        if not 0 <= frame_index < self.frames:
+            raise InputError(f"{self.path}: has no frame {frame_index}; frames are 0 to {self.frames - 1}")
+        row = self._row_of_index.get(self.source_index[frame_index])
         if row is None:
-            raise InputError(f"{self.sequence.path}: has no frame {self.source_index[position]}; is it the recording?")
+            raise InputError(
+                f"{self.sequence.path}: has no frame {self.source_index[frame_index]}; is it the recording?"
+            )
         return self.sequence[row].image
 
     @cached_property
@@ -150,10 +154,10 @@ class RunFolder:
         order = np.argsort(self.tracks.frame, kind="stable")
         return order, np.searchsorted(self.tracks.frame[order], np.arange(self.frames + 1))
 
-    def rows_at(self, position: int) -> Int64:
+    def rows_at(self, frame_index: int) -> Int64:
         """Rows of `tracks` that belong to one frame."""
         order, bounds = self._rows_by_frame
-        return order[bounds[position] : bounds[position + 1]]
+        return order[bounds[frame_index] : bounds[frame_index + 1]]
 
     @cached_property
     def birth(self) -> Int64:
@@ -173,25 +177,36 @@ class RunFolder:
         labels = np.where(self.points.track[order[found]] == ids, self.points.stability[order[found]], IGNORE)
         return labels[index].astype(np.int8)
 
-    def rows_of(self, position: int, tracks: Int64) -> Int64:
+    def rows_of(self, frame_index: int, tracks: Int64) -> Int64:
         """Rows of `tracks` where one frame saw the given tracks, -1 where it did not."""
-        rows = self.rows_at(position)
+        rows = self.rows_at(frame_index)
         ids = self.tracks.track[rows]  # increasing: the table is sorted by track
         if len(ids) == 0:
             return np.full(len(tracks), -1, np.int64)
         found = np.minimum(np.searchsorted(ids, tracks), len(ids) - 1)
         return np.where(ids[found] == tracks, rows[found], -1)
 
-    def observations(self, position: int) -> Observations:
+    def observations(self, frame_index: int) -> Observations:
         """The tracks of one frame."""
-        rows = self.rows_at(position)
+        rows = self.rows_at(frame_index)
         return Observations(
             self.tracks.track[rows],
             self.tracks.keypoints[rows].astype(np.float64),
             self.tracks.error[rows].astype(np.float64),
-            position - self.birth[rows],
+            frame_index - self.birth[rows],
             self.stability_of_rows[rows],
         )
+
+
+def _with_present_names(report: dict[str, Any]) -> dict[str, Any]:
+    """The content of run.json, also of one that was written when events and settings had other names."""
+    events = [
+        {("frame_index" if key == "position" else key): value for key, value in event.items()}
+        for event in report.get("events", [])
+    ]
+    for event in events:
+        event["kind"] = _FORMER_KINDS.get(event["kind"], event["kind"])
+    return {**report, "events": events, "configuration": config.with_present_names(report.get("configuration", {}))}
 
 
 def read_map(path: Path) -> SparseMap:

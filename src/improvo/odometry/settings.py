@@ -13,13 +13,17 @@ class MatchingSettings:
     """Matching of consecutive frames (paper, "Point Tracks")."""
 
     max_distance: float = 0.7  # tau on unit descriptors; binary ones use the equivalent share of bits
-    max_stray: float = 0.0  # of a link from the frame's median motion, share of the width; 0: any, as in the paper
-    refind_radius: float = 8.0  # pixels at 640 wide: how far from its projection a lost map point is looked for
-    refind_frames: int = 60  # map points not seen for longer than this are not looked for
+    # A link farther than this from the frame's median flow is dropped; a share of the image width. 0 keeps every
+    # link, as the paper does.
+    flow_outlier_limit: float = 0.0
+    search_radius: float = 8.0  # pixels at a width of 640, between a map point's projection and its keypoint
+    search_frames: int = 60  # search by projection is for the map points of this many last frames
 
     def __post_init__(self) -> None:
-        if not self.max_stray >= 0:
-            raise ConfigError(f"max_stray={self.max_stray}: is a share of the image width, 0 for no limit")
+        if not self.flow_outlier_limit >= 0:
+            raise ConfigError(
+                f"flow_outlier_limit={self.flow_outlier_limit}: is a share of the image width, 0 for no limit"
+            )
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,7 @@ class StartSettings:
     min_common_tracks: int = 30  # of the earliest view that the newest still overlaps
     min_matches: int = 60  # between the two, matched afresh
     min_rotation_residual: float = 2.0  # pixels, median that the best pure rotation leaves of the matches
-    max_waiting: int = 300  # frames kept while waiting for enough parallax
+    max_buffered: int = 300  # frames in the initialisation buffer; the oldest leaves it without a pose
     epipolar_error: float = 1.0  # pixels, RANSAC threshold of the essential matrix and of the homography
     max_homography_ratio: float = 0.7  # homography inliers / essential inliers; more is too little parallax
     # points of the essential matrix that the homography leaves; so many show parallax whatever the ratio is
@@ -39,8 +43,8 @@ class StartSettings:
     min_points: int = 30  # over the minimum parallax
     min_inlier_share: float = 0.3  # essential inliers of the matches
     max_mean_error: float = 1.2  # pixels, after adjustment and pruning
-    max_lost: int = 4  # waiting frames in a row, such as black ones, that may stay without a pose
-    max_patience: int = 30  # frames between two tries, doubled from 3 with each costly refusal
+    max_lost: int = 4  # buffered frames in a row, such as black ones, that may stay without a pose
+    max_cooldown: int = 30  # frames between two tries, doubled from 3 with each costly failure
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,7 @@ class WindowSettings:
 
     recent: int = 15  # last consecutive frames, free
     keyframes: int = 15  # older keyframes, free
-    constants: int = 30  # still older keyframes, kept as constants with their observations
+    fixed: int = 30  # still older keyframes; their poses stay, their observations count
     keyframe_motion: float = 0.05  # median pixel motion since the last keyframe, as a share of the image width
     keyframe_shared: float = 0.6  # or: share of the last keyframe's map points still seen
     keyframe_interval: int = 15  # or: frames since the last keyframe
@@ -78,11 +82,11 @@ class HealthSettings:
     rounds: int = 3  # consecutive checks that are judged together
     min_evidence: int = 100  # inliers in all of them; fewer decide nothing
     min_agreement: float = 0.85  # right maps stay over 0.90, wrong ones fall under 0.80
-    young_frames: int = 60  # a map contradicted this early is started anew over the same frames
+    provisional_frames: int = 60  # a map is provisional this long: contradicted, it starts anew over the same frames
 
 
 @dataclass(frozen=True)
-class TrustSettings:
+class RansacGateSettings:
     """Which keypoints a RANSAC may use, by their stability; a mover that fills its sample becomes the world."""
 
     least_stability: float = 0.5  # of a keypoint, and of both ends of a match; 0 lets all in
@@ -90,18 +94,18 @@ class TrustSettings:
 
     def __post_init__(self) -> None:
         if not 0 <= self.least_stability <= 1:
-            raise ConfigError(f"trust.least_stability={self.least_stability}: is a probability between 0 and 1")
+            raise ConfigError(f"ransac_gate.least_stability={self.least_stability}: is a probability between 0 and 1")
 
 
 @dataclass(frozen=True)
 class OdometrySettings:
     """Settings of `VisualOdometry`."""
 
-    initialisation: str = "robust"  # `robust`, or `paper`: previous pose, unit depth, nothing else
+    mode: str = "robust"  # `robust`, or `paper`: previous pose, unit depth, nothing else
     seed: int = 0
     matching: MatchingSettings = field(default_factory=MatchingSettings)
     start: StartSettings = field(default_factory=StartSettings)
-    trust: TrustSettings = field(default_factory=TrustSettings)
+    ransac_gate: RansacGateSettings = field(default_factory=RansacGateSettings)
     window: WindowSettings = field(default_factory=WindowSettings)
     loss: TrackingLossSettings = field(default_factory=TrackingLossSettings)
     health: HealthSettings = field(default_factory=HealthSettings)
@@ -111,5 +115,5 @@ class OdometrySettings:
     paper_solver: SolverSettings = field(default_factory=lambda: SolverSettings(100, relative_decrease=1e-6))
 
     def __post_init__(self) -> None:
-        if self.initialisation not in ("robust", "paper"):
-            raise ConfigError(f"initialisation {self.initialisation!r}: choose `robust` or `paper`")
+        if self.mode not in ("robust", "paper"):
+            raise ConfigError(f"mode {self.mode!r}: choose `robust` or `paper`")

@@ -14,7 +14,7 @@ from improvo.geometry.camera import Camera
 from improvo.geometry.triangulation import triangulate_tracks
 from improvo.odometry.local_map import LocalMap, poselib_camera
 from improvo.odometry.settings import OdometrySettings, StartSettings
-from improvo.odometry.view import NO_POINT, View, common_tracks, trusted_pairs
+from improvo.odometry.view import NO_POINT, View, common_tracks, ransac_pairs
 from improvo.odometry.window import adjust
 from improvo.tracking.matching import match_units
 from improvo.types import Float64, Int64
@@ -32,7 +32,7 @@ class TwoView:
 
 
 @dataclass(frozen=True)
-class Refusal:
+class InitFailure:
     """Why two views cannot start a map, in plain words."""
 
     reason: str
@@ -41,7 +41,7 @@ class Refusal:
 
 def two_view_geometry(
     a: View, b: View, camera: Camera, odometry: OdometrySettings, descriptor_distance: float
-) -> TwoView | Refusal:
+) -> TwoView | InitFailure:
     """Relative pose of two views by the five-point algorithm, gated by a rotation and by a homography.
 
     Where a pure rotation explains the matches, or a homography does about as well as an essential matrix, the
@@ -49,9 +49,9 @@ def two_view_geometry(
     """
     settings = odometry.start
     matches = match_units(a.descriptors, b.descriptors, descriptor_distance)
-    rows_a, rows_b = matches[trusted_pairs(a, b, matches, odometry.trust)].T
+    rows_a, rows_b = matches[ransac_pairs(a, b, matches, odometry.ransac_gate)].T
     if len(rows_a) < settings.min_matches:
-        return Refusal("too few matches")
+        return InitFailure("too few matches")
     pixels_a, pixels_b = a.keypoints[rows_a], b.keypoints[rows_b]
     options = {
         "max_epipolar_error": settings.epipolar_error,
@@ -65,14 +65,14 @@ def two_view_geometry(
     homography, planar = poselib.estimate_homography(pixels_a, pixels_b, options)
     inliers = np.asarray(essential["inliers"], bool)
     if inliers.sum() < max(settings.min_inlier_share * len(rows_a), settings.min_points):
-        return Refusal("too few matches agree on a motion")
+        return InitFailure("too few matches agree on a motion")
     if np.median(rotation_residuals(camera, pixels_a[inliers], pixels_b[inliers])) < settings.min_rotation_residual:
-        return Refusal("too little parallax: a rotation explains the motion")
+        return InitFailure("too little parallax: a rotation explains the motion")
     ratio = np.sum(planar["inliers"]) / max(inliers.sum(), 1)
     on_plane = np.asarray(planar["inliers"], bool)
     if ratio > settings.max_homography_ratio and (inliers & ~on_plane).sum() < settings.min_off_plane_points:
         if ratio < settings.plane_ratio:
-            return Refusal("too little parallax")
+            return InitFailure("too little parallax")
         return _from_plane(a, b, rows_a, rows_b, homography, on_plane, camera, settings)
     return _points_of(a, b, rows_a[inliers], rows_b[inliers], se3.rigid(pose.R, pose.t), camera, settings)
 
@@ -95,7 +95,7 @@ def rotation_residuals(camera: Camera, pixels_a: Float64, pixels_b: Float64) -> 
 
 def _points_of(
     a: View, b: View, rows_a: Int64, rows_b: Int64, b_from_a: Float64, camera: Camera, settings: StartSettings
-) -> TwoView | Refusal:
+) -> TwoView | InitFailure:
     """Triangulate the matches; refuse if too few have parallax."""
     count = len(rows_a)
     keypoints = np.stack([a.keypoints[rows_a], b.keypoints[rows_b]], axis=1).reshape(-1, 2)
@@ -108,7 +108,7 @@ def _points_of(
         result.in_front & (worst <= 2.0 * settings.epipolar_error) & (parallax_deg > 0.25 * settings.min_parallax_deg)
     )
     if (parallax_deg[good] >= settings.min_parallax_deg).sum() < settings.min_points:
-        return Refusal("too little parallax")
+        return InitFailure("too little parallax")
     return TwoView(b_from_a, rows_a[good], rows_b[good], result.points[good], parallax_deg[good])
 
 
@@ -121,7 +121,7 @@ def _from_plane(
     inliers: np.ndarray,
     camera: Camera,
     settings: StartSettings,
-) -> TwoView | Refusal:
+) -> TwoView | InitFailure:
     """The motion over a plane whose decomposition puts most points in front of both cameras, if it is unique."""
     normalised = np.linalg.inv(camera.K) @ homography @ camera.K
     solutions = []
@@ -135,55 +135,55 @@ def _from_plane(
             solutions.append(points)
     solutions.sort(key=lambda solution: -len(solution.rows_a))
     if not solutions:
-        return Refusal("too little parallax")
+        return InitFailure("too little parallax")
     if len(solutions) > 1 and len(solutions[1].rows_a) > 0.75 * len(solutions[0].rows_a):
-        return Refusal("a plane with two possible motions")
+        return InitFailure("a plane with two possible motions")
     return solutions[0]
 
 
 def start_map(
     waiting: Sequence[View], camera: Camera, settings: OdometrySettings, descriptor_distance: float
-) -> LocalMap | Refusal:
+) -> LocalMap | InitFailure:
     """Poses for all waiting views from the first good pair (earliest view with enough common tracks, last view).
 
     Every other view gets the full step, PnP, triangulation and adjustment, going backwards from the last.
 
     Returns:
         The map, world = camera of the first view that got a pose, median depth 1; or why it is too early. After a
-        refusal the views have neither poses nor points.
+        failure the views have neither poses nor points.
     """
     start = settings.start
     b = waiting[-1]
     a = next((v for v in waiting[:-1] if len(common_tracks(v, b)[0]) >= start.min_common_tracks), None)
     if a is None:
-        return Refusal("too few tracks")
+        return InitFailure("too few tracks")
     pair = two_view_geometry(a, b, camera, settings, descriptor_distance)
-    if isinstance(pair, Refusal):
+    if isinstance(pair, InitFailure):
         return pair
     local_map = LocalMap(camera, settings, descriptor_distance)
-    refusal = _grow(waiting, a, b, pair, local_map, settings)
-    if refusal is not None:
+    failure = _grow(waiting, a, b, pair, local_map, settings)
+    if failure is not None:
         for view in waiting:
             view.cam_from_world = None
             view.points[:] = NO_POINT
-        return refusal
+        return failure
     _normalise([view for view in waiting if view.cam_from_world is not None], local_map)
     return local_map
 
 
 def _grow(
     waiting: Sequence[View], a: View, b: View, pair: TwoView, local_map: LocalMap, settings: OdometrySettings
-) -> Refusal | None:
+) -> InitFailure | None:
     """Two views, then all others backwards, then all together."""
     K, store, start = local_map.camera.K, local_map.store, settings.start
-    ids = store.add(pair.xyz, b.position)
+    ids = store.add(pair.xyz, b.frame_index)
     a.cam_from_world, b.cam_from_world = np.eye(4), pair.b_from_a
     a.points[pair.rows_a], b.points[pair.rows_b] = ids, ids
     solver = SolverSettings(max_iterations=30, relative_decrease=1e-4)
     max_error = settings.window.max_error
     report = adjust([b], [a], store, K, settings.objective, solver, max_error)
     if report.mean_error > start.max_mean_error or report.kept < 2 * start.min_points:
-        return Refusal("the first two views do not fit")
+        return InitFailure("the first two views do not fit")
     local_map.remember(a)
     local_map.remember(b)
     done = [b]
@@ -195,29 +195,29 @@ def _grow(
                 missed += 1
                 if missed <= start.max_lost:
                     continue
-                if view.position > a.position:
-                    return Refusal("the first views do not fit together", costly=True)
+                if view.frame_index > a.frame_index:
+                    return InitFailure("the first views do not fit together", costly=True)
                 break  # what lies before is another place, or too blurred
             missed = 0
         done.append(view)
         others = done[-16:-1]
         local_map.triangulate(view, others if view is a or a in others else [*others, a])
-        free, constant = _start_window(done, a)
-        adjust(free, constant, store, K, settings.objective, settings.solver, max_error)
+        free, fixed = _start_window(done, a)
+        adjust(free, fixed, store, K, settings.objective, settings.solver, max_error)
         local_map.remember(view)
         neighbour = view
-    first, *rest = sorted(done, key=lambda view: view.position)
+    first, *rest = sorted(done, key=lambda view: view.frame_index)
     report = adjust(rest, [first], store, K, settings.objective, solver, max_error)
     if not report.mean_error <= start.max_mean_error:
-        return Refusal("the first views do not fit together", costly=True)
+        return InitFailure("the first views do not fit together", costly=True)
     return None
 
 
 def _start_window(done: list[View], a: View) -> tuple[list[View], list[View]]:
-    """The last views free, the earlier ones and the first pair's `a` constant."""
+    """The last views free, the earlier ones and the first pair's `a` fixed."""
     free = [view for view in done[-15:] if view is not a]
-    constant = [a, *(view for view in done[:-15] if view is not a)][:31]
-    return free, constant
+    fixed = [a, *(view for view in done[:-15] if view is not a)][:31]
+    return free, fixed
 
 
 def _normalise(views: Sequence[View], local_map: LocalMap) -> None:

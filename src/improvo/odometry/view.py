@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from improvo.odometry.settings import TrustSettings
+from improvo.odometry.settings import RansacGateSettings
 from improvo.types import Float32, Float64, Int64
 
 NO_POINT = -1
@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 class View:
     """A frame with its features, tracks, map points and pose; mutable, internal to the odometry."""
 
-    position: int  # in the processed sequence, 0-based
+    frame_index: int  # in the processed sequence, 0-based
     time: float
     keypoints: Float64  # (N, 2) pixels
     descriptors: Float32  # (N, D) unit vectors
@@ -29,7 +29,7 @@ class View:
     keyframe: bool = False
     final: bool = False
     segment: int = -1  # number of the segment that the pose belongs to
-    followers: list[tuple[View, Float64]] = field(default_factory=list)
+    non_keyframes: list[tuple[View, Float64]] = field(default_factory=list)
     # views that left the window and move with this keyframe until it is final, with their cam_from_keyframe
 
     @property
@@ -59,8 +59,8 @@ class PointStore:
         """(P,) position of the last view that observed each point, a view that may be written to."""
         return self._last_seen[: self.count]
 
-    def add(self, xyz: Float64, position: int) -> Int64:
-        """New points (N, 3), seen at `position`; returns their ids (N,)."""
+    def add(self, xyz: Float64, frame_index: int) -> Int64:
+        """New points (N, 3), seen at `frame_index`; returns their ids (N,)."""
         ids = np.arange(self.count, self.count + len(xyz), dtype=np.int64)
         needed = self.count + len(xyz)
         if needed > len(self._xyz):
@@ -69,7 +69,7 @@ class PointStore:
             self._last_seen = np.concatenate([self.last_seen, np.full(capacity - self.count, -1, np.int64)])
         self.count = needed
         self._xyz[ids] = xyz
-        self._last_seen[ids] = position
+        self._last_seen[ids] = frame_index
         return ids
 
 
@@ -79,15 +79,15 @@ def common_tracks(a: View, b: View) -> tuple[Int64, Int64]:
     return rows_a.astype(np.int64), rows_b.astype(np.int64)
 
 
-def trusted_pairs(a: View, b: View, matches: Int64, trust: TrustSettings) -> Mask:
+def ransac_pairs(a: View, b: View, matches: Int64, gate: RansacGateSettings) -> Mask:
     """Which of the matches (K, 2), rows of `a` and of `b`, a RANSAC may use: those trusted at both ends."""
-    return trusted(np.minimum(a.weights[matches[:, 0]], b.weights[matches[:, 1]]), trust)
+    return ransac_rows(np.minimum(a.weights[matches[:, 0]], b.weights[matches[:, 1]]), gate)
 
 
-def trusted(weights: Float64, trust: TrustSettings) -> Mask:
+def ransac_rows(weights: Float64, gate: RansacGateSettings) -> Mask:
     """(N,) which of the weights w_ij are high enough for a RANSAC; all, where those would be too few."""
-    stable = weights >= trust.least_stability
-    return stable if stable.sum() >= trust.enough else np.ones(len(weights), bool)
+    stable = weights >= gate.least_stability
+    return stable if stable.sum() >= gate.enough else np.ones(len(weights), bool)
 
 
 def inherit_points(view: View, neighbour: View) -> None:

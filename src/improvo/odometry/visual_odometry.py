@@ -15,7 +15,7 @@ from improvo.odometry.robust import RobustMapper
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
 from improvo.tracking.connect import TrackChain
-from improvo.tracking.matching import distance_threshold, match_units, unit_descriptors, without_strays
+from improvo.tracking.matching import distance_threshold, match_units, unit_descriptors, without_flow_outliers
 from improvo.types import Features, Float32, Float64, Frame, Int64, SparseMap, Trajectory
 
 
@@ -73,9 +73,9 @@ class VisualOdometry:
         if self._matched_before is not None:
             keypoints_before, descriptors_before = self._matched_before
             matches = match_units(descriptors_before, descriptors, self._max_distance(features))
-            if self._settings.matching.max_stray > 0:
-                limit = self._settings.matching.max_stray * self._camera.width
-                matches = without_strays(matches, keypoints_before, features.keypoints, limit)
+            if self._settings.matching.flow_outlier_limit > 0:
+                limit = self._settings.matching.flow_outlier_limit * self._camera.width
+                matches = without_flow_outliers(matches, keypoints_before, features.keypoints, limit)
         self._matched_before = features.keypoints, descriptors
         return MatchedFeatures(features, descriptors, matches)
 
@@ -84,7 +84,7 @@ class VisualOdometry:
         features = matched.features
         view = self._extend_tracks(matched, time)
         if self._mapper is None:
-            mapper = RobustMapper if self._settings.initialisation == "robust" else PaperMapper
+            mapper = RobustMapper if self._settings.mode == "robust" else PaperMapper
             self._mapper = mapper(self._camera, self._settings, self._max_distance(features), self._journal)
         self._mapper.track(view)
         self._previous = view
@@ -131,7 +131,7 @@ class VisualOdometry:
             tracks = self._chain.extend(self._previous.tracks, matched.matches, len(features))
         weights = features.weights() if self._use_stability else np.ones(len(features))
         return View(
-            position=self._count,
+            frame_index=self._count,
             time=time,
             keypoints=features.keypoints.astype(np.float64),
             descriptors=matched.descriptors,

@@ -1,4 +1,4 @@
-"""How the odometry shows itself: to a viewer that is handed to it, and that may do nothing."""
+"""How the odometry shows itself: to a visualizer that is handed to it, and that may do nothing."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from improvo.odometry.view import View
 from improvo.types import Float64, Frame
 
 
-class Viewer(Protocol):
-    """What a viewer is told."""
+class Visualizer(Protocol):
+    """What a visualizer is told."""
 
     def begin(self, camera: Camera) -> None:
         """A run begins."""
@@ -22,7 +22,7 @@ class Viewer(Protocol):
         """The run is over."""
 
 
-class NullViewer:
+class NullVisualizer:
     """Nobody looks."""
 
     def begin(self, camera: Camera) -> None:

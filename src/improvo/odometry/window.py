@@ -43,24 +43,24 @@ class _Observations:
 
 def adjust(
     free: Sequence[View],
-    constant: Sequence[View],
+    fixed: Sequence[View],
     store: PointStore,
     K: Float64,
     objective: ObjectiveSettings,
     solver: SolverSettings,
     max_error: float | None,
 ) -> WindowReport:
-    """Adjust the poses of `free` and all points that they observe; poses of `constant` stay.
+    """Adjust the poses of `free` and all points that they observe; poses of `fixed` stay.
 
     Observations that end over `max_error` pixels or behind the camera are dropped, and the window is solved again if
     they were many; None drops nothing (mode `paper`).
     """
-    views = [*free, *constant]
-    fixed = np.arange(len(views)) >= len(free)
+    views = [*free, *fixed]
+    is_fixed = np.arange(len(views)) >= len(free)
     observations = _gather(views, len(free), store)
     if len(observations.camera) == 0:
         return WindowReport(float("nan"), 0, 0, 0)
-    result = _solve(views, fixed, observations, store, K, objective, solver)
+    result = _solve(views, is_fixed, observations, store, K, objective, solver)
     if max_error is None:
         return WindowReport(float(result.errors.mean()), len(result.errors), 0, result.iterations)
     iterations = result.iterations
@@ -69,7 +69,7 @@ def adjust(
     _drop(views, observations, bad)
     if dropped > _WORTH_SOLVING_AGAIN * len(bad):
         observations = _gather(views, len(free), store)
-        result = _solve(views, fixed, observations, store, K, objective, solver)
+        result = _solve(views, is_fixed, observations, store, K, objective, solver)
         iterations += result.iterations
         bad = _misfits(result, max_error)
         dropped += int(bad.sum())
@@ -101,7 +101,7 @@ def _gather(views: Sequence[View], free_count: int, store: PointStore) -> _Obser
 
 def _solve(
     views: Sequence[View],
-    fixed: Mask,
+    is_fixed: Mask,
     observations: _Observations,
     store: PointStore,
     K: Float64,
@@ -120,13 +120,13 @@ def _solve(
             keypoints=np.concatenate([view.keypoints[part] for view, part in zip(views, parts, strict=True)]),
             weights=np.concatenate([view.weights[part] for view, part in zip(views, parts, strict=True)]),
             K=K,
-            fixed_cameras=fixed,
+            fixed_cameras=is_fixed,
         ),
         objective,
         solver,
     )
     store.xyz[observations.ids] = result.points
-    for i in np.flatnonzero(~fixed).tolist():
+    for i in np.flatnonzero(~is_fixed).tolist():
         views[i].cam_from_world = result.cam_from_world[i]
     return result
 

@@ -32,7 +32,7 @@ def draw_map(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"], l
     if len(trajectory) == 0:
         raise InputError(f"{run.path}: no frame has a pose, so there is no map to draw; see `events` in run.json")
     axes_of_world = overhead_axes(trajectory.world_from_cam)
-    path_2d = axes_of_world.project(trajectory.positions)
+    path_2d = axes_of_world.project(trajectory.camera_centers)
     shown = trusted_points(run.map)
     points_2d = axes_of_world.project(run.map.xyz[shown])
     low, high = robust_limits(path_2d, points_2d)
@@ -56,7 +56,7 @@ def draw_map(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"], l
 
     links = np.stack([path_2d[:-1], path_2d[1:]], axis=1)
     joined = trajectory.segment[:-1] == trajectory.segment[1:]
-    colours = palette.ramp_colours(run.positions[1:].astype(float), 0, max(run.frames - 1, 1)) / 255.0
+    colours = palette.ramp_colours(run.frame_indices[1:].astype(float), 0, max(run.frames - 1, 1)) / 255.0
     axis.add_collection(
         LineCollection(list(links[joined]), colors=colours[joined], linewidths=3.0, capstyle="round", zorder=3)
     )

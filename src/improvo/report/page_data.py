@@ -30,7 +30,7 @@ def scene_data(run: RunFolder, palette: Palette) -> dict[str, Any]:
     trajectory = run.trajectory
     axes = overhead_axes(trajectory.world_from_cam)
     scene_from_world = np.stack([axes.right, axes.forward, -axes.down])
-    centres = trajectory.positions @ scene_from_world.T
+    centres = trajectory.camera_centers @ scene_from_world.T
     map_rows = _some(trusted_points(run.map))
     map_points = run.map.xyz[map_rows] @ scene_from_world.T
     labelled = np.flatnonzero(
@@ -50,7 +50,7 @@ def scene_data(run: RunFolder, palette: Palette) -> dict[str, Any]:
             "labels": _layer(label_points, palette.label_colours(run.points.stability[label_rows])),
         },
         "poses": _base64(poses.astype("<f4")),
-        "positions": run.positions.tolist(),
+        "positions": run.frame_indices.tolist(),
         "segments": trajectory.segment.tolist(),
         "frames": run.frames,
         "last": min(_LAST_POSES, max(len(trajectory) - 1, 0)),

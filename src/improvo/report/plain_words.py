@@ -59,14 +59,14 @@ def _events(report: dict[str, Any]) -> list[str]:
     for event in report["events"]:
         by_kind.setdefault(event["kind"], []).append(event)
     for kind, word in (("lost", "Lost"), ("contradiction", "Doubtful")):
-        lines += [f"{word} at frame {event['position']}: {event['detail']}." for event in by_kind.pop(kind, [])[:5]]
-    waiting = by_kind.pop("waiting", [])
+        lines += [f"{word} at frame {event['frame_index']}: {event['detail']}." for event in by_kind.pop(kind, [])[:5]]
+    waiting = by_kind.pop("initialising", [])
     if waiting and report["frames"]["lost"]:  # frames that only waited get their pose once the map has begun
         last = waiting[-1]
-        lines.append(f"The map could not begin; the last reason, at frame {last['position']}: {last['detail']}.")
+        lines.append(f"The map could not begin; the last reason, at frame {last['frame_index']}: {last['detail']}.")
     by_kind.pop("segment", None)  # said by the number of pieces
     for kind, events in by_kind.items():
-        lines.append(f"{kind.capitalize()} at frame {events[0]['position']}: {events[0]['detail']}.")
+        lines.append(f"{kind.capitalize()} at frame {events[0]['frame_index']}: {events[0]['detail']}.")
     return lines
 
 

@@ -27,7 +27,7 @@ _MAP_EVERY = 10  # frames between two pictures of the whole map
 
 
 class RerunViewer:
-    """An `improvo.odometry.visualizer.Viewer` that shows a run in Rerun.
+    """An `improvo.odometry.visualizer.Visualizer` that shows a run in Rerun.
 
     Args:
         save: a `.rrd` file to write, which works without a screen; None opens the viewer.
@@ -54,9 +54,9 @@ class RerunViewer:
     def show(self, frame: Frame, view: View, points: Float64) -> None:
         """A frame was processed."""
         recording, now = self._recording, time.perf_counter()
-        recording.at(view.position, view.time)
-        self._births = {track: self._births.get(track, view.position) for track in view.tracks.tolist()}
-        age = view.position - np.array([self._births[track] for track in view.tracks.tolist()], np.int64)
+        recording.at(view.frame_index, view.time)
+        self._births = {track: self._births.get(track, view.frame_index) for track in view.tracks.tolist()}
+        age = view.frame_index - np.array([self._births[track] for track in view.tracks.tolist()], np.int64)
         colours = self._palette.ramp_colours(age, 0, _OLD)
         recording.image(frame.image)
         recording.keypoints(view.keypoints, colours)
@@ -75,7 +75,7 @@ class RerunViewer:
         self._path.append(world_from_cam[:3, 3])
         self._recording.pose(world_from_cam)
         self._recording.trajectory(np.array(self._path), self._palette)
-        if len(points) and view.position % _MAP_EVERY == 0:
+        if len(points) and view.frame_index % _MAP_EVERY == 0:
             self._recording.points(points, np.full((len(points), 3), 200, np.uint8))
         seen = view.points[view.observed]
         if len(seen) and int(seen.max()) < len(points):
@@ -100,14 +100,14 @@ def show_run(
     """
     recording = _Recording(save)
     recording.open(run.camera)
-    row_of_position = {int(position): row for row, position in enumerate(run.positions)}
+    row_of_position = {int(position): row for row, position in enumerate(run.frame_indices)}
     times = run.sequence.times if images else np.zeros(0)
     labelled = np.flatnonzero((run.points.stability != IGNORE) & np.isfinite(run.points.xyz).all(axis=1))
     recording.points(
         run.points.xyz[labelled], palette.label_colours(run.points.stability[labelled]), "world/labels", static=True
     )
     recording.points(run.map.xyz, np.full((len(run.map), 3), 200, np.uint8), static=True)
-    recording.trajectory(run.trajectory.positions, palette, static=True)
+    recording.trajectory(run.trajectory.camera_centers, palette, static=True)
     for position in range(run.frames):
         row = row_of_position.get(position)
         recording.at(position, float(run.trajectory.times[row]) if row is not None else _time(times, run, position))

@@ -143,7 +143,7 @@ def _truth(sequence: Sequence, problems: list[Problem]) -> dict[str, Any] | None
                 "evaluation leaves them out; if it is all of them, compare the two clocks",
             )
         )
-    path = float(np.linalg.norm(np.diff(truth.positions[truth.valid], axis=0), axis=1).sum())
+    path = float(np.linalg.norm(np.diff(truth.camera_centers[truth.valid], axis=0), axis=1).sum())
     return {"poses": valid, "path_length": round(path, 4)}
 
 

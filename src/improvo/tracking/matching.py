@@ -57,11 +57,17 @@ def match_units(a: Float32, b: Float32, max_distance: float | None = None) -> In
     return np.stack([rows, nearest_in_b[rows]], axis=1)
 
 
-def without_strays(matches: Int64, keypoints_a: Float32, keypoints_b: Float32, limit: float) -> Int64:
+def without_flow_outliers(matches: Int64, keypoints_a: Float32, keypoints_b: Float32, limit: float) -> Int64:
     """The pairs (K, 2) whose motion is at most `limit` pixels from the median motion of all.
 
-    Between frames of a video nothing jumps, so a pair far from what all others do is a mistaken identity. The median
-    goes along with a camera that turns fast.
+    Points move little between two frames of a video. A pair that moves very differently from the others is a wrong
+    match. The median follows a camera that turns fast.
+
+    Args:
+        matches: (K, 2) rows of `keypoints_a` and of `keypoints_b`.
+        keypoints_a: (N, 2) pixels.
+        keypoints_b: (M, 2) pixels.
+        limit: pixels.
     """
     if len(matches) == 0:
         return matches
