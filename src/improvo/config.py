@@ -99,7 +99,7 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings") -> 
     _refuse_unknown_keys(cls, values, where, prefix="")
     if all(_has_default(field) for field in dataclasses.fields(cls)):  # type: ignore[arg-type]
         # a section given in part keeps what this class has for the rest of it, not the section's own defaults
-        values = _over(to_dict(cls()), values)
+        values = over(to_dict(cls()), values)
     converter = cattrs.Converter(forbid_extra_keys=True)
     converter.register_structure_hook(bool, _strict(bool))
     converter.register_structure_hook(int, _strict(int))
@@ -139,28 +139,17 @@ def _section_of(cls: type) -> str:
     return cls.__name__.removesuffix("Settings").lower()
 
 
-def first_difference(before: Any, now: Any, prefix: str = "") -> str:
-    """The first setting that differs between two nested dictionaries, in words; empty where none does."""
-    if not (isinstance(before, dict) and isinstance(now, dict)):
-        return "" if before == now else f"{prefix.rstrip('.')}={before}, now {now}"
-    for key in [*before, *(key for key in now if key not in before)]:
-        difference = first_difference(before.get(key), now.get(key), f"{prefix}{key}.")
-        if difference:
-            return difference
-    return ""
-
-
-def _has_default(field: dataclasses.Field[Any]) -> bool:
-    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
-
-
-def _over(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+def over(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
     """Nested dictionaries: the values, and the defaults where there is none."""
     result = dict(defaults)
     for key, value in values.items():
         below = result.get(key)
-        result[key] = _over(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+        result[key] = over(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
     return result
+
+
+def _has_default(field: dataclasses.Field[Any]) -> bool:
+    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
 
 def _strict(kind: type) -> Any:

@@ -8,17 +8,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from improvo import config
-from improvo.errors import ConfigError, InputError
-from improvo.files import check_output_folder, make_output_folder, write_text
+from improvo.continuation import SettingsRecord
+from improvo.files import check_output_folder, make_output_folder
 from improvo.improvement.candidate import Candidate
 from improvo.improvement.settings import ImproveSettings
 
 COMMAND = "improve"
 # what may differ when a run is continued: none of these alters a result
-_FREE = {"training.optimiser": ("device", "threads", "workers", "checkpoint_minutes", "log_every")}
+_FREE = ("device", "threads", "workers", "checkpoint_minutes", "log_every")
 
 
 class Workspace:
@@ -45,7 +43,7 @@ class Workspace:
     ) -> None:
         check_output_folder(folder, COMMAND)
         self.folder = folder
-        values = _fixed(settings)
+        values = config.to_dict(settings)
         values["frontend"]["name"] = f"sha256:{hashlib.sha256(start.read_bytes()).hexdigest()}"
         values["sequences"] = [str(path.resolve()) for path in sequences]
         values["evaluate"] = [str(path.resolve()) for path in evaluate]
@@ -88,36 +86,18 @@ class Workspace:
         return self.folder / "report.html"
 
     def _begin(self, values: dict[str, Any]) -> None:
-        path = self.folder / "settings.yaml"
-        if path.is_file():
-            try:
-                before = yaml.safe_load(path.read_text())
-            except yaml.YAMLError:
-                raise InputError(f"{path}: is damaged; choose another output folder") from None
-            difference = config.first_difference(before, values)
-            if difference and not self.split.is_file():  # nothing has come of it yet
-                for folder in (self.survey, self.start.folder):
-                    shutil.rmtree(folder, ignore_errors=True)
-            elif difference:
-                raise ConfigError(
-                    f"{self.folder}: was begun with {difference}; give the same again, or another output folder"
-                )
+        free = [f"training.optimiser.{name}" for name in _FREE]
+        record = SettingsRecord(self.folder / "settings.yaml", config.to_dict(ImproveSettings()), free)
+        if self.split.is_file():
+            record.check(values, "give the same again, or another output folder")
+        elif record.difference(values):  # nothing has come of it yet
+            for folder in (self.survey, self.start.folder):
+                shutil.rmtree(folder, ignore_errors=True)
         make_output_folder(self.folder, COMMAND)
-        write_text(path, yaml.safe_dump(values, sort_keys=False))
+        record.write(values)
         for leftover in list(self.folder.rglob(".*.partial*")):  # of a killed run; some lie in others
             if leftover.is_dir():
                 shutil.rmtree(leftover, ignore_errors=True)
             else:
                 leftover.unlink(missing_ok=True)
 
-
-def _fixed(settings: ImproveSettings) -> dict[str, Any]:
-    """The settings that the result depends on."""
-    values = config.to_dict(settings)
-    for section, names in _FREE.items():
-        target = values
-        for name in section.split("."):
-            target = target[name]
-        for name in names:
-            target.pop(name)
-    return values

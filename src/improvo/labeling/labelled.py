@@ -9,9 +9,9 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from improvo import config
+from improvo.continuation import SettingsRecord
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import inverse
@@ -102,10 +102,10 @@ def read_labels(folder: Path) -> list[LabelledSequence]:
     """
     records = read_records(folder)
     try:
-        values = yaml.safe_load((folder / SETTINGS_FILE).read_text())
+        values = SettingsRecord(folder / SETTINGS_FILE).read()
         settings = config.from_dict(SequenceSettings, values["sequence"], where=str(folder / SETTINGS_FILE))
         rule = config.from_dict(LabelSettings, values["labels"], where=str(folder / SETTINGS_FILE))
-    except (OSError, yaml.YAMLError, KeyError, TypeError):
+    except (KeyError, TypeError):
         raise InputError(f"{folder}: is no label store; `improvo label SEQUENCE... -o {folder}` makes one") from None
     done = [record for record in records if record.state == DONE]
     if not done:

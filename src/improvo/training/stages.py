@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from improvo import __version__, config, files
+from improvo.continuation import SettingsRecord
 from improvo.errors import ConfigError, InputError
 from improvo.frontend.architecture import ARCHITECTURES, Architecture
 from improvo.frontend.channel_pruning import with_dead_channels, without_dead_channels
@@ -165,9 +166,10 @@ def _rehearsal(
 def _same_labels(path: Path, sequences: Sequence[LabelledSequence]) -> None:
     """Remember what a folder is trained on; refuse to continue it with other labels."""
     now = [[s.name, s.record.frames, s.record.tracks, s.record.stable, s.record.unstable] for s in sequences]
-    if path.is_file() and json.loads(path.read_text()) != now:
+    record = SettingsRecord(path)
+    if record.difference(now):
         raise InputError(f"{path.parent}: was begun with other labels; give the same stores or another output folder")
-    files.write_json(path, now)
+    record.write(now)
 
 
 def _run(
@@ -315,16 +317,7 @@ _FREE = ("steps", "decay_steps", "device", "threads", "workers", "checkpoint_min
 
 def _same_settings(path: Path, settings: StageSettings) -> None:
     """Remember the settings of the folder; refuse to continue it under others."""
-
-    def fixed(values: dict[str, Any]) -> dict[str, Any]:
-        optimiser = {key: value for key, value in values["optimiser"].items() if key not in _FREE}
-        return {**values, "optimiser": optimiser}
-
-    if path.is_file():
-        before, now = fixed(config.to_dict(config.load(type(settings), path))), fixed(config.to_dict(settings))
-        changed = config.first_difference(before, now)
-        if changed:
-            raise ConfigError(
-                f"{path.parent}: was begun with {changed}; give the same settings or another output folder"
-            )
-    files.write_text(path, config.to_yaml(settings))
+    values, defaults = config.to_dict(settings), config.to_dict(type(settings)())
+    record = SettingsRecord(path, defaults, [f"optimiser.{name}" for name in _FREE])
+    record.check(values, "give the same settings or another output folder")
+    record.write(values)
