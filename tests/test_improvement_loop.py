@@ -55,7 +55,7 @@ def results(out: Path) -> dict[str, object]:
     found: dict[str, object] = {
         str(path.relative_to(out)): path.read_bytes()
         for path in sorted(out.rglob("*"))
-        if path.name in (*LABEL_TABLES, "split.json", "settings.yaml") and "training" not in path.parts
+        if path.name in (*LABEL_TABLES, "split.json") and "training" not in path.parts
     }
     for path in sorted(out.rglob("weights.safetensors")):
         for name, value in load_weights(path).tensors.items():
