@@ -112,6 +112,27 @@ def test_packed_frames_need_no_recording(walks: list[Path], tmp_path: Path) -> N
     assert np.abs(packed.astype(int) - picture).mean() < 3
 
 
+@pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_termination_ends_the_command_and_the_next_one_goes_on(
+    labelled: Path, walks: list[Path], tmp_path: Path, workers: str
+) -> None:
+    out = tmp_path / "labels"
+    command = [sys.executable, "-m", "improvo", "label", *map(str, walks), "-o", str(out), "--workers", workers]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen([*command, *OPTIONS], env=environment, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 60
+        while not list(out.glob(".*.partial/.tracks*")) and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        process.terminate()
+        _, said = process.communicate(timeout=60)
+        assert process.returncode == 130
+    assert "improvo: interrupted" in said
+    assert "Traceback" not in said
+    assert main([*command[3:], *OPTIONS]) == 0
+    assert contents(out) == contents(labelled)
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
 def test_a_killed_run_resumes_to_the_same_labels(labelled: Path, walks: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "labels"

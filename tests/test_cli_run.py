@@ -115,8 +115,9 @@ def test_one_unreadable_frame_is_skipped_and_named(walk: Path, tmp_path: Path) -
     assert report["frames"]["tracked"] == 23
 
 
-@pytest.mark.skipif(not hasattr(signal, "SIGINT") or os.name == "nt", reason="needs POSIX signals")
-def test_an_interrupt_leaves_a_valid_partial_result(walk: Path, tmp_path: Path) -> None:
+@pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_leaves_a_valid_partial_result(walk: Path, tmp_path: Path, number: int) -> None:
     long = tmp_path / "long"
     long.mkdir()
     pictures = sorted(walk.glob("*.png"))
@@ -137,7 +138,7 @@ def test_an_interrupt_leaves_a_valid_partial_result(walk: Path, tmp_path: Path) 
         ten_or_more = re.compile(rb"\| +\d{2,}/")  # a fast machine's progress line skips numbers
         while not ten_or_more.search(seen) and time.monotonic() < deadline and process.poll() is None:
             seen += process.stderr.read1(4096)  # type: ignore[attr-defined]
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         process.stderr.read()
         assert process.wait(timeout=120) == 130
     report = json.loads((out / "run.json").read_text())

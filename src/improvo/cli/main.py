@@ -11,6 +11,7 @@ from types import ModuleType
 
 from improvo import __version__
 from improvo.errors import ImprovoError
+from improvo.jobs.interrupts import termination_interrupts
 
 # verb -> (module under improvo.cli, help line). A module has `add_arguments(parser)` and `run(arguments)`, which
 # returns int or None; a verb with its own sub-commands adds them with `parser.add_subparsers`. Heavy imports belong
@@ -48,7 +49,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         verb = next((word for word in words if not word.startswith("-")), None)
         arguments = _parser(verb).parse_args(words)
-        return int(arguments.module.run(arguments) or 0)
+        with termination_interrupts():
+            return int(arguments.module.run(arguments) or 0)
     except ImprovoError as error:
         print(f"improvo: {error}", file=sys.stderr)
         return 2

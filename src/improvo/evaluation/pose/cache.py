@@ -107,4 +107,3 @@ def write_cache(folder: Path, fingerprint: dict[str, Any], features: dict[int, F
             shutil.rmtree(temporary, ignore_errors=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written ({error.strerror or error}); choose another folder") from None
-
