@@ -7,13 +7,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import poselib
 
 from backend_windows import Recording, triangulate
 from improvo.backend import BundleProblem, BundleResult, SolverSettings, solve
 from improvo.geometry import se3
 from improvo.geometry.alignment import align_points
+from improvo.geometry.camera import Camera
 from improvo.geometry.triangulation import triangulate_tracks
+from improvo.geometry.two_view import Ransac, absolute_pose
 from improvo.types import Float64, Int64
 
 WINDOW = 30  # poses that are optimised (paper, N_last)
@@ -154,18 +155,13 @@ def _absolute_pose(state: State, frame: int, watch: _Stopwatch) -> Float64:
     recording = state.recording
     rows = np.flatnonzero((recording.camera_index == frame) & np.isfinite(state.points[recording.track, 0]))
     K = recording.K
-    camera = {
-        "model": "PINHOLE",
-        "width": int(2 * K[0, 2] + 1),
-        "height": int(2 * K[1, 2] + 1),
-        "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
-    }
-    options = {"max_reproj_error": 2 * MAX_ERROR, "seed": frame, "min_iterations": 50}
+    camera = Camera(int(2 * K[0, 2] + 1), int(2 * K[1, 2] + 1), K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    ransac = Ransac(2 * MAX_ERROR, seed=frame, min_iterations=50)
     points = state.points[recording.track[rows]]
     keypoints = recording.keypoints[rows]
     with watch:
-        pose, _ = poselib.estimate_absolute_pose(keypoints, points, camera, options, {})
-    return se3.rigid(np.asarray(pose.R), np.asarray(pose.t))
+        found = absolute_pose(points, keypoints, camera, ransac)
+    return found.pose
 
 
 def _solve_window(

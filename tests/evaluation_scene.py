@@ -112,13 +112,13 @@ class PlaneFeatures:
     def features(self, sequence: Any, frame: Frame) -> Features:
         if self.log:
             with Path(self.log).open("a") as file:
-                file.write(f"{frame.index}\n")
-        pose = inverse(sequence.poses[frame.index])
+                file.write(f"{frame.source_index}\n")
+        pose = inverse(sequence.poses[frame.source_index])
         points = transform(pose, sequence.points)
         pixels = CAMERA.project(points)
         inside = (points[:, 2] > 0.1) & (pixels >= 0).all(axis=1) & (pixels <= [159, 119]).all(axis=1)
         ids = np.zeros(0, np.int64) if self.blind else np.flatnonzero(inside)[: self.max_keypoints]
-        rng = np.random.default_rng(frame.index)
+        rng = np.random.default_rng(frame.source_index)
         descriptors = np.random.default_rng(1).normal(size=(len(sequence.points), 32)).astype(np.float32)
         descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
         given = rng.permutation(ids) if self.shuffled else ids

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -159,6 +161,40 @@ def test_kernels_compile_ahead_of_time():
     assert kernels_are_cached()
     compile_kernels(said.append)
     assert said == []
+
+
+def test_a_run_compiles_nothing_after_its_first_frame():
+    """In a fresh process: once `compile_odometry` is done, no kernel meets a new signature."""
+    code = """
+import sys
+from pathlib import Path
+import numpy as np
+from numba.core.registry import CPUDispatcher
+from simulated_features import CAMERA, hand_motion, observe, room
+from improvo.frontend.corners import refine_to_corners
+from improvo.odometry.compile import compile_odometry
+from improvo.odometry.visual_odometry import VisualOdometry
+from improvo.stability.rule import label_stability
+
+def signatures():
+    rooms = [module for name, module in list(sys.modules.items()) if name.startswith("improvo")]
+    found = {value for module in rooms for value in vars(module).values() if isinstance(value, CPUDispatcher)}
+    return {(kernel.py_func.__qualname__, str(types)) for kernel in found for types in kernel.signatures}
+
+compile_odometry()
+before = signatures()
+odometry = VisualOdometry(None, CAMERA)
+for i, pose in enumerate(hand_motion(40)):
+    odometry.track_features(observe(room(), pose, seed=i), i / 30)
+odometry.finish()
+assert len(odometry.map) > 100
+refine_to_corners(np.random.default_rng(0).random((60, 80)), np.full((3, 2), 20.0, np.float32), radius=3)
+print(sorted(signatures() - before))
+"""
+    tests = str(Path(__file__).parent)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([tests, os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr
 
 
 def test_kernels_work_where_nothing_can_be_cached(monkeypatch):

@@ -110,7 +110,7 @@ class StabilityFrontend:
         self._next += 1
         features = PlaneFeatures(noise=0.2).features(self._sequence, frame)
         jumping = features.descriptors[:, 0] > 0.15  # about a fifth, the same points in every frame
-        rng = np.random.default_rng(frame.index)
+        rng = np.random.default_rng(frame.source_index)
         keypoints = features.keypoints + rng.uniform(-6, 6, features.keypoints.shape) * jumping[:, None]
         stability = np.where(jumping, 0.001, 1.0).astype(np.float32)
         return Features(keypoints.astype(np.float32), features.descriptors, features.scores, stability)

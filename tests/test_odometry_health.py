@@ -6,7 +6,7 @@ import numpy as np
 from simulated_features import CAMERA, hand_motion, observe, room
 
 from improvo.geometry import se3
-from improvo.odometry.health import HealthCheck, epipolar_errors
+from improvo.odometry.health import HealthCheck
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
 from improvo.tracking.matching import unit_descriptors
@@ -62,12 +62,3 @@ def test_a_wrong_turn_is_contradicted() -> None:
     truth = hand_motion(40)
     extra = se3.rigid(se3.so3_exp(np.radians(1.5) * np.arange(40)[:, None] * [0.0, 0.0, 1.0]), np.zeros((40, 3)))
     assert alarms(truth @ extra, truth)
-
-
-def test_epipolar_errors_are_pixels_from_the_line() -> None:
-    b_from_a = se3.rigid(np.eye(3), np.array([1.0, 0.0, 0.0]))  # sideways: lines are rows
-    pixels_a = np.array([[100.0, 80.0], [200.0, 120.0]])
-    pixels_b = pixels_a + np.array([[30.0, 0.0], [10.0, 2.0]])
-    np.testing.assert_allclose(
-        epipolar_errors(b_from_a, CAMERA, pixels_a, pixels_b), [0.0, 2.0 / np.sqrt(2)], atol=1e-9
-    )

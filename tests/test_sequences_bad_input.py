@@ -87,8 +87,8 @@ def test_one_unreadable_frame_is_skipped_counted_and_named(tmp_path: Path, damag
         data = file.read_bytes()
         file.write_bytes({"empty": b"", "text": b"not an image", "cut": data[: 2 * len(data) // 3]}[damage])
     sequence = open_sequence(tmp_path)
-    assert [frame.index for frame in sequence] == [0, 1, 2, 3, 5, 6, 7, 8]
-    assert [frame.index for frame in sequence] == [0, 1, 2, 3, 5, 6, 7, 8]  # a second pass counts it once
+    assert [frame.source_index for frame in sequence] == [0, 1, 2, 3, 5, 6, 7, 8]
+    assert [frame.source_index for frame in sequence] == [0, 1, 2, 3, 5, 6, 7, 8]  # a second pass counts it once
     assert [(skip.index, skip.source) for skip in sequence.skipped] == [(4, str(file))]
     assert sequence.skipped[0].reason
     assert sequence[5].time == pytest.approx(5 / 30)
@@ -101,7 +101,7 @@ def test_one_unreadable_frame_is_skipped_counted_and_named(tmp_path: Path, damag
 def test_the_first_frame_may_be_unreadable_but_not_all(tmp_path: Path) -> None:
     folder_of_images(tmp_path, 3)
     (tmp_path / "000000.png").write_bytes(b"")
-    assert [frame.index for frame in open_sequence(tmp_path)] == [1, 2]
+    assert [frame.source_index for frame in open_sequence(tmp_path)] == [1, 2]
     for file in tmp_path.glob("*.png"):
         file.write_bytes(b"x")
     assert "none of the first frames can be read" in refused(tmp_path)
@@ -114,7 +114,7 @@ def test_images_cut_at_any_byte(tmp_path: Path) -> None:
         for length in range(0, len(data) - 2, max(1, len(data) // 25)):
             (folder / f"000001.{suffix}").write_bytes(data[:length])
             sequence = open_sequence(folder)
-            assert [frame.index for frame in sequence] == [0, 2], length
+            assert [frame.source_index for frame in sequence] == [0, 2], length
 
 
 def test_bad_ground_truth_is_counted_and_named(tmp_path: Path) -> None:

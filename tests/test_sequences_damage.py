@@ -139,7 +139,7 @@ def test_sens_frame_that_cannot_be_decoded_is_skipped(tmp_path: Path) -> None:
     data[third : third + 4] = b"JUNK"
     path.write_bytes(data)
     sequence = open_sequence(path)
-    assert [frame.index for frame in sequence] == [0, 1, 3, 4]
+    assert [frame.source_index for frame in sequence] == [0, 1, 3, 4]
     assert [skip.source for skip in sequence.skipped] == [f"{path}#2"]
 
 
@@ -187,7 +187,7 @@ def test_bag_with_an_unknown_encoding_skips_those_frames(tmp_path: Path) -> None
             encoding = "mono8" if i != 2 else "hologram"
             bag.write("/image", bag.image((i + 1) * 10**9, image, encoding), (i + 1) * 10**9)
     sequence = open_sequence(tmp_path / "p.bag", fov=60.0)
-    assert [frame.index for frame in sequence] == [0, 1, 3]
+    assert [frame.source_index for frame in sequence] == [0, 1, 3]
     assert "hologram" in sequence.skipped[0].reason
 
 

@@ -78,7 +78,7 @@ def test_round_trip_is_exact(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(sequence.times, start + np.arange(COUNT) * step, rtol=0, atol=1e-9)
     for i, frame in enumerate(sequence):
         assert (frame.image == expected.images[i]).all()
-        assert frame.index == i
+        assert frame.source_index == i
     assert not sequence.skipped
     for i in (3, 0, 5, 2):
         assert (sequence[i].image == expected.images[i]).all()
@@ -235,7 +235,7 @@ def test_random_access_and_iteration_agree_in_long_bags(tmp_path: Path) -> None:
         sequence: Sequence = open_sequence(ros_encoders.write_bag(path, long, version))
         for i in np.random.default_rng(0).permutation(40).tolist():
             assert (sequence[i].image == long.images[i]).all()
-        assert [frame.index for frame in open_sequence(path, stride=13)] == [0, 13, 26, 39]
+        assert [frame.source_index for frame in open_sequence(path, stride=13)] == [0, 13, 26, 39]
 
 
 def test_jpeg_in_sens_and_in_bags(tmp_path: Path) -> None:

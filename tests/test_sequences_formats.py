@@ -26,7 +26,7 @@ def test_tum_round_trip_is_exact(tmp_path: Path) -> None:
     np.testing.assert_allclose(sequence.times, times, atol=1e-6)
     for i, (frame, image, depth) in enumerate(zip(sequence, images(COUNT), depths(COUNT), strict=True)):
         assert (frame.image == image).all()
-        assert frame.index == i
+        assert frame.source_index == i
         assert frame.time == sequence.times[i]
         np.testing.assert_array_equal(sequence.depth(i), depth)
     assert sequence.ground_truth is not None
@@ -142,7 +142,7 @@ def test_image_folder_may_be_named_by_its_inside(tmp_path: Path) -> None:
 def test_selection_keeps_recording_indices_and_times(tmp_path: Path) -> None:
     times = write_tum(tmp_path)
     sequence = open_sequence(tmp_path, SequenceSettings(start=1, end=6, stride=2), max_frames=2)
-    assert [frame.index for frame in sequence] == [1, 3]
+    assert [frame.source_index for frame in sequence] == [1, 3]
     np.testing.assert_allclose(sequence.times, times[[1, 3]], atol=1e-6)
     assert (sequence[1].image == images(COUNT)[3]).all()
     np.testing.assert_array_equal(sequence.depth(1), depths(COUNT)[3])

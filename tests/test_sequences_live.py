@@ -49,8 +49,8 @@ def test_slow_reader_gets_the_latest_frames_and_the_drops_are_counted(camera: Fa
         len(sequence)
     seen = []
     for frame in sequence:
-        seen.append(frame.index)
-        assert (frame.image == frame.index).all()  # the frame's own pixels tell that the count is right
+        seen.append(frame.source_index)
+        assert (frame.image == frame.source_index).all()  # the frame's own pixels tell that the count is right
         time.sleep(0.035)
     assert (np.diff(seen) > 0).all()
     assert len(seen) < 30

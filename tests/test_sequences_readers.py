@@ -62,7 +62,7 @@ def test_own_reader_is_recognised_and_read(tmp_path: Path) -> None:
     np.save(tmp_path / "s.npy", stack)
     sequence = open_sequence(tmp_path / "s.npy", stride=1)
     assert sequence.format == "stack"
-    assert [frame.index for frame in sequence] == [0, 1, 2, 4]
+    assert [frame.source_index for frame in sequence] == [0, 1, 2, 4]
     assert (sequence[4].image == stack[4]).all()
     assert sequence.skipped[0].reason == "the frame is empty"
     assert (sequence.camera.width, sequence.camera.fx) == (32, 60.0)

@@ -39,8 +39,8 @@ def test_random_access_gives_the_frames_of_iteration(tmp_path: Path, name: str, 
         assert (sequence[i].image == in_order[i].image).all(), i
         assert sequence[i].time == in_order[i].time
     strided = open_sequence(tmp_path / name, fov=60.0, start=3, stride=17)
-    assert [frame.index for frame in strided] == [3, 20, 37, 54]
-    assert all((frame.image == in_order[frame.index].image).all() for frame in strided)
+    assert [frame.source_index for frame in strided] == [3, 20, 37, 54]
+    assert all((frame.image == in_order[frame.source_index].image).all() for frame in strided)
     assert [frame.time for frame in strided] == [in_order[i].time for i in (3, 20, 37, 54)]
 
 
@@ -70,7 +70,7 @@ def test_video_cut_short_gives_the_frames_it_has(tmp_path: Path) -> None:
     frames = list(sequence)
     assert COUNT // 3 < len(frames) < 2 * COUNT // 3
     assert len(frames) + len(sequence.skipped) == len(sequence)
-    undamaged = [(frame.image == whole[frame.index].image).all() for frame in frames]
+    undamaged = [(frame.image == whole[frame.source_index].image).all() for frame in frames]
     assert sum(undamaged) >= len(frames) - 1
 
 

@@ -8,7 +8,8 @@ calls becomes part of it, so after an edit of the callee touch the file of the c
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
 from numba import njit
@@ -24,6 +25,16 @@ def compiled(function: Callable[..., Any]) -> Any:
 def inlined(function: Callable[..., Any]) -> Any:
     """A small part of kernels that becomes part of its callers before they are compiled."""
     return _jit(function, inline="always")
+
+
+def all_cached(kernels: Iterable[Any]) -> bool:
+    """Whether each kernel has machine code on disk; it may still be stale, which only costs a compilation."""
+    return all(_is_cached(kernel) for kernel in kernels)
+
+
+def _is_cached(kernel: Any) -> bool:
+    folder = kernel.stats.cache_path  # None where nothing can be cached
+    return folder is not None and any(Path(folder).glob(f"*.{kernel.__name__}-*.nbi"))
 
 
 def _jit(function: Callable[..., Any], **options: Any) -> Any:

@@ -21,7 +21,7 @@ UInt8 = NDArray[np.uint8]
 class Frame:
     """One image of a sequence, as delivered: undistorted, resized, grey."""
 
-    index: int  # position in the recording, before any stride
+    source_index: int  # number of the frame in the recording, before any stride
     time: float  # seconds, the recording's own clock
     image: UInt8  # (H, W)
     source: str  # the file, or "video.mp4#123"
@@ -60,7 +60,7 @@ class Features:
 class Tracks:
     """Connect-the-dots tracks as flat observations, one row per (frame, track), sorted by track, then frame."""
 
-    frame: Int64  # (M,) position in the processed sequence (after stride), 0-based
+    frame: Int64  # (M,) frame_index: number of the frame in the processed sequence (after any stride), from 0
     track: Int64  # (M,) track id
     keypoints: Float32  # (M, 2) pixels
     weight: Float32  # (M,) observation confidence w_ij

@@ -79,9 +79,9 @@ def arrange(problem: BundleProblem, objective: ObjectiveSettings) -> tuple[Const
     free_number[camera_of_free] = np.arange(free)
     camera_index = np.ascontiguousarray(problem.camera_index, np.int64)
     point_index = np.ascontiguousarray(problem.point_index, np.int64)
-    order, first, first_fixed = _sort(free_number[camera_index], point_index, free, len(problem.points))
+    order, first, first_fixed = sort_observations(free_number[camera_index], point_index, free, len(problem.points))
     free_camera = free_number[camera_index[order]]
-    first_of_camera, run_end = _find_runs(free_camera, first, first_fixed)
+    first_of_camera, run_end = find_runs(free_camera, first, first_fixed)
     first_camera = np.append(free_camera, free)[np.where(first_fixed > first[:-1], first[:-1], len(order))]
     observations = Observations(
         order,
@@ -129,7 +129,7 @@ def _aligned(count: int) -> Float64:
 
 
 @compiled
-def _sort(free_camera, point, free, points):  # type: ignore[no-untyped-def]
+def sort_observations(free_camera, point, free, points):  # type: ignore[no-untyped-def]
     """Counting sort by camera, then a stable one by point: `order`, `first` and `first_fixed` of `Observations`."""
     observations = len(point)
     by_camera = np.empty(observations, np.int64)
@@ -161,7 +161,7 @@ def _sort(free_camera, point, free, points):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _find_runs(free_camera, first, first_fixed):  # type: ignore[no-untyped-def]
+def find_runs(free_camera, first, first_fixed):  # type: ignore[no-untyped-def]
     """`first_of_camera` and `run_end` of `Observations`."""
     first_of_camera, run_end = np.arange(len(free_camera)), np.arange(1, len(free_camera) + 1)
     for j in range(len(first_fixed)):

@@ -1,4 +1,4 @@
-"""Compiling the kernels ahead of time, so that a progress line can say so.
+"""Compiling the kernels of the backend ahead of time, so that a progress line can say so.
 
 Numba compiles a kernel when it is first called and caches the machine code beside the source (or in the user's cache
 folder, or where NUMBA_CACHE_DIR says), so this takes seconds once per installation and a fraction of one afterwards.
@@ -7,23 +7,30 @@ folder, or where NUMBA_CACHE_DIR says), so this takes seconds once per installat
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
 from improvo.backend.simulated import simulated_window
+from improvo.compiled import all_cached
 
 
 def kernels_are_cached() -> bool:
-    """Whether a compiled copy of the solver is on disk; it may still be stale, which only costs a compilation."""
-    from improvo.backend import reduced
+    """Whether compiled copies of the solver and of the triangulation are on disk."""
+    from improvo.backend import arrange, eliminate, linearise, reduced, step
     from improvo.geometry import triangulation_kernels
 
-    kernels = (reduced.solve_step, triangulation_kernels.triangulate_all)
-    folders = [kernel.stats.cache_path for kernel in kernels]  # None where nothing can be cached
-    return all(
-        folder is not None and any(Path(folder).glob(f"*{kernel.__name__}-*.nbi"))
-        for kernel, folder in zip(kernels, folders, strict=True)
+    return all_cached(
+        (
+            arrange.sort_observations,
+            arrange.find_runs,
+            linearise.linearise,
+            linearise.evaluate,
+            linearise.errors_and_depths,
+            eliminate.eliminate,
+            reduced.solve_step,
+            step.try_step,
+            triangulation_kernels.triangulate_all,
+        )
     )
 
 

@@ -198,7 +198,7 @@ def _export(arguments: argparse.Namespace) -> int:
                 frame = sequence[row]
             except ImprovoError:
                 continue  # its pairs are left out of the evaluation, too
-            with written_atomically(folder / f"{frame.index:06d}.png") as temporary:
+            with written_atomically(folder / f"{frame.source_index:06d}.png") as temporary:
                 cv2.imwrite(str(temporary), frame.image)
             written += 1
     print(f"{written} images in {arguments.export_images}; export features as SEQUENCE/NUMBER.npz beside or elsewhere")

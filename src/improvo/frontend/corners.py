@@ -7,10 +7,10 @@ gradients are sharp to a fraction of that. Each keypoint goes to the largest sma
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from improvo.compiled import compiled
 from improvo.types import Float32
 
 _EDGE = 3  # pixels of the image that a response needs around its own: smoothing, gradient and 3×3 window
@@ -33,12 +33,12 @@ def refine_to_corners(image: Float32, keypoints: Float32, radius: int) -> tuple[
     steps = np.arange(-radius, radius + 1)
     falloff = np.exp(-(steps[:, None] ** 2 + steps**2) / (2 * (radius / 1.5) ** 2)).astype(np.float32)
     image = np.ascontiguousarray(image, np.float32)
-    moved, found = _refine(image, np.ascontiguousarray(keypoints, np.float32), radius, falloff)
+    moved, found = move_to_corners(image, np.ascontiguousarray(keypoints, np.float32), radius, falloff)
     return moved, found
 
 
-@numba.njit(cache=True, nogil=True)
-def _refine(image, keypoints, radius, falloff):  # type: ignore[no-untyped-def]
+@compiled
+def move_to_corners(image, keypoints, radius, falloff):  # type: ignore[no-untyped-def]
     height, width = image.shape
     reach = radius + 1  # the parabola needs the neighbours of the best
     side = 2 * (reach + _EDGE) + 1
@@ -96,7 +96,7 @@ def _refine(image, keypoints, radius, falloff):  # type: ignore[no-untyped-def]
     return result, found
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _peak(before, middle, after):  # type: ignore[no-untyped-def]
     """Where, at most half a pixel away, the parabola through three values is largest; 0 if the middle is no maximum."""
     bend = before - 2 * middle + after

@@ -11,15 +11,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import poselib
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.odometry.local_map import poselib_camera
+from improvo.geometry.two_view import Ransac, relative_pose, sampson_errors
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View, ransac_pairs
 from improvo.tracking.matching import match_units
-from improvo.types import Float64, Int64
+from improvo.types import Int64
 
 _FEATURES = 600  # the strongest of each view; all of them would only cost time
 
@@ -87,30 +86,11 @@ def agreement(a: View, b: View, camera: Camera, descriptor_distance: float, sett
     pixels_a, pixels_b = a.keypoints[matches[:, 0]], b.keypoints[matches[:, 1]]
     used = ransac_pairs(a, b, matches, settings.ransac_gate)
     limit = settings.health.epipolar_error
-    shape = poselib_camera(camera)
-    own, report = poselib.estimate_relative_pose(
-        pixels_a[used],
-        pixels_b[used],
-        shape,
-        shape,
-        {"max_epipolar_error": limit, "min_iterations": 100, "max_iterations": 1000, "seed": settings.seed},
-    )
+    ransac = Ransac(limit, settings.seed, min_iterations=100, max_iterations=1000)
+    own = relative_pose(pixels_a[used], pixels_b[used], camera, ransac)
     of_map = b.cam_from_world @ se3.inverse(a.cam_from_world)
     fits_map, fits_own = (
-        epipolar_errors(b_from_a, camera, pixels_a, pixels_b) < limit for b_from_a in (of_map, se3.rigid(own.R, own.t))
+        sampson_errors(b_from_a, camera, pixels_a, pixels_b) < limit for b_from_a in (of_map, own.pose)
     )
-    fits_own[used] = report["inliers"]  # which also lie in front of both
+    fits_own[used] = own.inliers  # which also lie in front of both
     return Agreement(int(fits_map.sum()), int(fits_own.sum()), len(matches))
-
-
-def epipolar_errors(b_from_a: Float64, camera: Camera, pixels_a: Float64, pixels_b: Float64) -> Float64:
-    """Sampson distance in pixels (N,) of matches to a relative pose."""
-    x, y, z = b_from_a[:3, 3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    rays_a, rays_b = camera.unproject(pixels_a), camera.unproject(pixels_b)
-    lines_b = rays_a @ (cross @ b_from_a[:3, :3]).T
-    lines_a = rays_b @ (cross @ b_from_a[:3, :3])
-    algebraic = (rays_b * lines_b).sum(axis=1)
-    slope = (lines_b[:, :2] ** 2).sum(axis=1) + (lines_a[:, :2] ** 2).sum(axis=1)
-    focal = np.sqrt(camera.fx * camera.fy)
-    return focal * np.abs(algebraic) / np.sqrt(np.maximum(slope, 1e-18))

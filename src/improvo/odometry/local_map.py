@@ -6,11 +6,11 @@ from collections import deque
 from collections.abc import Iterable
 
 import numpy as np
-import poselib
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.geometry.triangulation import triangulate_tracks
+from improvo.geometry.two_view import Ransac, absolute_pose
 from improvo.odometry.projection_search import match_by_projection
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_points, ransac_rows
@@ -79,19 +79,11 @@ class LocalMap:
             return 0, 0.0
         max_error = self._settings.window.max_error
         used = ransac_rows(view.weights[rows], self._settings.ransac_gate)
-        pose, report = poselib.estimate_absolute_pose(
-            view.keypoints[rows[used]],
-            self.store.xyz[view.points[rows[used]]],
-            poselib_camera(self.camera),
-            {
-                "max_reproj_error": max_error,
-                "min_iterations": 100,
-                "max_iterations": 2000,
-                "seed": self._settings.seed,
-            },
-        )
-        inliers = np.asarray(report["inliers"], bool)
-        view.cam_from_world = se3.rigid(pose.R, pose.t)
+        ransac = Ransac(max_error, self._settings.seed, min_iterations=100, max_iterations=2000)
+        points = self.store.xyz[view.points[rows[used]]]
+        found = absolute_pose(points, view.keypoints[rows[used]], self.camera, ransac)
+        inliers = found.inliers
+        view.cam_from_world = found.pose
         fits = np.zeros(len(rows), bool)
         fits[used] = inliers
         if not used.all():
@@ -170,13 +162,3 @@ class LocalMap:
             of_view = (camera == i) & (point >= 0)
             v.points[row[of_view]] = point[of_view]
         return int(good.sum())
-
-
-def poselib_camera(camera: Camera) -> dict[str, object]:
-    """The camera as PoseLib wants it."""
-    return {
-        "model": "PINHOLE",
-        "width": camera.width,
-        "height": camera.height,
-        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
-    }

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from improvo.compiled import compiled
 from improvo.types import Float32, Float64, Int64
 
 
@@ -29,7 +29,7 @@ def match_by_projection(
     if len(projections) == 0 or len(keypoints) == 0:
         return np.zeros((0, 2), np.int64)
     order, cell_starts, columns, rows, origin = _grid(keypoints, radius)
-    keypoint_of_point, similarity = _best_in_radius(
+    keypoint_of_point, similarity = best_in_radius(
         projections,
         point_descriptors,
         keypoints,
@@ -59,8 +59,8 @@ def _grid(keypoints: Float64, cell: float) -> tuple[Int64, Int64, int, int, Floa
     return order, np.searchsorted(flat[order], np.arange(columns * rows + 1)), columns, rows, origin
 
 
-@numba.njit(cache=True, nogil=True)
-def _best_in_radius(  # type: ignore[no-untyped-def]
+@compiled
+def best_in_radius(  # type: ignore[no-untyped-def]
     projections,
     point_descriptors,
     keypoints,

@@ -7,10 +7,11 @@ import numpy as np
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.odometry.health import HealthCheck
+from improvo.odometry.initial_pair import InitFailure
 from improvo.odometry.journal import Journal
 from improvo.odometry.local_map import LocalMap
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.start import InitFailure, start_map
+from improvo.odometry.start import start_map
 from improvo.odometry.view import NO_POINT, View, common_tracks
 from improvo.odometry.window import WindowReport, adjust
 

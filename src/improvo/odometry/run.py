@@ -119,7 +119,7 @@ def _track_all(
                 seconds["read"] += detected.reading
                 seconds["detect"] += detected.detecting
                 seconds["match"] += detected.matching
-                processed.append(detected.frame.index)
+                processed.append(detected.frame.source_index)
                 visualizer.show(detected.frame, view, odometry.running_points)
                 if progress is not None:
                     progress(view)

@@ -90,38 +90,22 @@ def carry(a: Features, b: Features, matches: Int64, depth_a: Float32 | None, cam
 
 
 def _carry_along_epipolar_lines(a: Features, b: Features, matches: Int64, camera: Camera) -> Carried:
-    import poselib
+    from improvo.geometry.two_view import Ransac, epipolar_lines, relative_pose
 
     pixels_a = a.keypoints[matches[:, 0]].astype(np.float64)
     pixels_b = b.keypoints[matches[:, 1]].astype(np.float64)
     if len(matches) < 8:
         return _nothing("too few matches for a pose")
-    description = {
-        "model": "PINHOLE",
-        "width": camera.width,
-        "height": camera.height,
-        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
-    }
-    options = {"max_epipolar_error": _EPIPOLAR_ERROR, "seed": 0}
-    pose, information = poselib.estimate_relative_pose(pixels_a, pixels_b, description, description, options, {})
-    lines = _epipolar_lines(np.asarray(pose.R), np.asarray(pose.t).ravel(), pixels_a, camera)
+    found = relative_pose(pixels_a, pixels_b, camera, Ransac(_EPIPOLAR_ERROR, seed=0))
+    lines = epipolar_lines(found.pose, camera, pixels_a)
     norm = np.linalg.norm(lines[:, :2], axis=1)
     if not np.isfinite(norm).all() or norm.min() < 1e-12:
         return _nothing("no pose was found")
     distance = (np.einsum("ni,ni->n", lines[:, :2], pixels_b) + lines[:, 2]) / norm
     predicted = pixels_b - distance[:, None] * lines[:, :2] / norm[:, None]
-    inliers = int(np.sum(information["inliers"]))
+    inliers = int(found.inliers.sum())
     how = f"no depth: nearest place on the epipolar line, {inliers} inliers"
     return Carried(matches, predicted, np.abs(distance), inliers, how)
-
-
-def _epipolar_lines(rotation: Float64, translation: Float64, pixels_a: Float64, camera: Camera) -> Float64:
-    """Lines (N, 3) in B, a x + b y + c = 0, on which pixels (N, 2) of A lie."""
-    x, y, z = translation
-    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    inverse_k = np.linalg.inv(camera.K)
-    fundamental = inverse_k.T @ skew @ rotation @ inverse_k
-    return np.column_stack([pixels_a, np.ones(len(pixels_a))]) @ fundamental.T
 
 
 def _nothing(how: str) -> Carried:

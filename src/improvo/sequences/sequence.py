@@ -115,7 +115,7 @@ class Sequence:
 
     def row(self, frame: Frame) -> int:
         """The row of a delivered frame in `times` and `ground_truth`, and the argument of `depth` for it."""
-        return int(np.searchsorted(self.indices, frame.index))
+        return int(np.searchsorted(self.indices, frame.source_index))
 
     def depth(self, i: int) -> Float32 | None:
         """Depth in metres (H, W) of the i-th selected frame, same geometry as its image, NaN where missing.

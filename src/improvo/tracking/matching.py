@@ -6,9 +6,9 @@ become (2b - 1) / sqrt(number of bits), for which the squared distance is 4 x (s
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from improvo.compiled import compiled
 from improvo.types import Features, Float32, Int64
 
 RANDOM_DISTANCE = float(np.sqrt(2.0))  # expected distance of two unrelated unit descriptors
@@ -49,7 +49,7 @@ def match_units(a: Float32, b: Float32, max_distance: float | None = None) -> In
     """As `mutual_nearest_neighbours`, on unit vectors (N, D) and (M, D), without scaling the threshold."""
     if len(a) == 0 or len(b) == 0:
         return np.zeros((0, 2), np.int64)
-    nearest_in_b, nearest_in_a, best = _nearest_both_ways(a @ b.T)
+    nearest_in_b, nearest_in_a, best = nearest_both_ways(a @ b.T)
     rows = np.flatnonzero(nearest_in_a[nearest_in_b] == np.arange(len(a)))
     if max_distance is not None:
         # ||x - y||^2 = 2 - 2 x.y for unit vectors
@@ -75,8 +75,8 @@ def without_flow_outliers(matches: Int64, keypoints_a: Float32, keypoints_b: Flo
     return matches[np.linalg.norm(motion - np.median(motion, axis=0), axis=1) <= limit]
 
 
-@numba.njit(cache=True, nogil=True)
-def _nearest_both_ways(similarity):  # type: ignore[no-untyped-def]
+@compiled
+def nearest_both_ways(similarity):  # type: ignore[no-untyped-def]
     """Largest entry of each row and of each column in one pass (the first of equals), and the rows' largest values.
 
     NumPy's argmax over columns alone costs as much as the product of the matrices.

@@ -98,8 +98,8 @@ def candidate_names(sequence_name: str, frame: Frame, one_sequence: bool) -> lis
     tails = ["/".join(parts[-count:]) for count in range(min(len(parts), 6), 1, -1)]
     # A bare file name, or a tail without the sequence in it, may mean a frame of another sequence.
     tails = tails if one_sequence else [tail for tail in tails if sequence_name in tail.split("/")]
-    numbered = [f"{sequence_name}/{parts[-1]}", f"{sequence_name}/{frame.index:06d}"]
-    bare = [parts[-1], f"{frame.index:06d}"] if one_sequence else []
+    numbered = [f"{sequence_name}/{parts[-1]}", f"{sequence_name}/{frame.source_index:06d}"]
+    bare = [parts[-1], f"{frame.source_index:06d}"] if one_sequence else []
     names: list[str] = []
     for stem in (*numbered, *tails, *bare):
         for name in (stem, f"{stem}.npz", str(PurePath(stem).with_suffix(".npz"))):

@@ -64,22 +64,14 @@ def with_poselib(points: Float64, pixels: Float64, camera: Camera, seed: int) ->
 
     Args and returns as `with_opencv`; `seed` is that of its sampling.
     """
-    import poselib
+    from improvo.geometry.two_view import Ransac, absolute_pose
 
     if len(points) < 4:
         return None
-    description = {
-        "model": "PINHOLE",
-        "width": camera.width,
-        "height": camera.height,
-        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
-    }
-    options = {"max_reproj_error": REPROJECTION_ERROR, "max_iterations": 10_000, "seed": seed}
-    pose, information = poselib.estimate_absolute_pose(pixels, points, description, options, {})
-    inliers = np.asarray(information["inliers"], np.bool_)
-    if not np.isfinite(pose.R).all() or not np.isfinite(pose.t).all() or inliers.sum() < 4:
+    found = absolute_pose(points, pixels, camera, Ransac(REPROJECTION_ERROR, seed, max_iterations=10_000))
+    if not np.isfinite(found.pose).all() or found.inliers.sum() < 4:
         return None
-    return PoseEstimate(rigid(np.asarray(pose.R), np.asarray(pose.t).ravel()), inliers)
+    return PoseEstimate(found.pose, found.inliers)
 
 
 ESTIMATORS: dict[str, Estimator] = {"opencv": with_opencv, "poselib": with_poselib}

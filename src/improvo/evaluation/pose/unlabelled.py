@@ -91,24 +91,13 @@ def surviving_matches(
 
 def agreeing_matches(a: Features, b: Features, camera: Camera, settings: SurvivalSettings) -> tuple[int, int]:
     """The number of mutual nearest neighbours, and of those that agree with the epipolar geometry most agree with."""
-    import poselib
+    from improvo.geometry.two_view import Ransac, relative_pose
 
     matches = mutual_nearest_neighbours(a, b, max_distance=None)
     if len(matches) < _MIN_MATCHES:
         return len(matches), 0
-    description = {
-        "model": "PINHOLE",
-        "width": camera.width,
-        "height": camera.height,
-        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
-    }
-    options = {
-        "max_epipolar_error": settings.max_epipolar_error,
-        "max_iterations": settings.max_iterations,
-        "seed": settings.seed,
-    }
+    ransac = Ransac(settings.max_epipolar_error, settings.seed, max_iterations=settings.max_iterations)
     pixels_a = a.keypoints[matches[:, 0]].astype(np.float64)
     pixels_b = b.keypoints[matches[:, 1]].astype(np.float64)
-    _, information = poselib.estimate_relative_pose(pixels_a, pixels_b, description, description, options, {})
-    agreeing = int(np.sum(information["inliers"]))
+    agreeing = int(relative_pose(pixels_a, pixels_b, camera, ransac).inliers.sum())
     return len(matches), agreeing if agreeing >= settings.min_agreeing else 0

@@ -150,7 +150,7 @@ def judge_frontend(frontend: Any, simulation: Path, stride: int = 10, threshold:
         features = frontend(frame.image)
         if features.stability is None:
             raise InputError("this frontend has no stability head; give a weights file that was trained with one")
-        causes.append(truth.at(frame.index, features.keypoints, frame.image.shape[1]))
+        causes.append(truth.at(frame.source_index, features.keypoints, frame.image.shape[1]))
         stability.append(features.stability.astype(np.float64))
     cause, stable = np.concatenate(causes), np.concatenate(stability)
     total = np.bincount(cause, minlength=len(PRECEDENCE)).astype(np.int64)

@@ -1,0 +1,116 @@
+"""Can two views start a map? Their relative pose, gated by what a rotation and a homography explain as well."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from improvo.geometry.camera import Camera
+from improvo.geometry.triangulation import triangulate_tracks
+from improvo.geometry.two_view import (
+    Ransac,
+    RobustHomography,
+    homography,
+    motions_of_homography,
+    relative_pose,
+    rotation_residuals,
+)
+from improvo.odometry.settings import OdometrySettings, StartSettings
+from improvo.odometry.view import View, ransac_pairs
+from improvo.tracking.matching import match_units
+from improvo.types import Float64, Int64
+
+_UNIQUE_SHARE = 0.75  # a second motion over a plane with more of the first one's points leaves the choice open
+
+
+@dataclass(frozen=True)
+class InitialPair:
+    """The relative pose of two views, and the points that support it."""
+
+    b_from_a: Float64  # (4, 4), baseline of length 1
+    rows_a: Int64  # (N,) keypoints of a
+    rows_b: Int64  # (N,) keypoints of b
+    xyz: Float64  # (N, 3) in camera a
+    parallax_deg: Float64  # (N,)
+
+
+@dataclass(frozen=True)
+class InitFailure:
+    """Why a map cannot start yet."""
+
+    reason: str
+    costly: bool = False  # found after much work, so that the next try should not follow with the very next frame
+
+
+def initial_pair(
+    a: View, b: View, camera: Camera, settings: OdometrySettings, descriptor_distance: float
+) -> InitialPair | InitFailure:
+    """Relative pose of two views by the five-point algorithm, or by the homography of a plane.
+
+    Where a pure rotation explains the matches, or a homography explains about as many as the essential matrix does,
+    the translation would be noise, and all depths with it. Two cases are accepted all the same: enough points off the
+    plane, as in front of a wall; and a scene that is one plane, if its homography stands for a single motion.
+
+    Args:
+        a: the earlier view.
+        b: the later view.
+        camera: pinhole, of both.
+        settings: of the odometry; `start` and `ransac_gate` are used.
+        descriptor_distance: the matching threshold on unit descriptors.
+    """
+    start = settings.start
+    matches = match_units(a.descriptors, b.descriptors, descriptor_distance)
+    rows_a, rows_b = matches[ransac_pairs(a, b, matches, settings.ransac_gate)].T
+    if len(rows_a) < start.min_matches:
+        return InitFailure("too few matches")
+    pixels_a, pixels_b = a.keypoints[rows_a], b.keypoints[rows_b]
+    ransac = Ransac(start.epipolar_error, settings.seed, min_iterations=200, max_iterations=5000)
+    essential = relative_pose(pixels_a, pixels_b, camera, ransac)
+    plane = homography(pixels_a, pixels_b, ransac)
+    inliers = essential.inliers
+    if inliers.sum() < max(start.min_inlier_share * len(rows_a), start.min_points):
+        return InitFailure("too few matches agree on a motion")
+    if np.median(rotation_residuals(camera, pixels_a[inliers], pixels_b[inliers])) < start.min_rotation_residual:
+        return InitFailure("too little parallax: a rotation explains the motion")
+    ratio = plane.inliers.sum() / max(inliers.sum(), 1)
+    off_plane = (inliers & ~plane.inliers).sum()
+    if ratio > start.max_homography_ratio and off_plane < start.min_off_plane_points:
+        if ratio < start.plane_ratio:
+            return InitFailure("too little parallax")
+        return _from_plane(a, b, rows_a, rows_b, plane, camera, start)
+    return _with_points(a, b, rows_a[inliers], rows_b[inliers], essential.pose, camera, start)
+
+
+def _with_points(
+    a: View, b: View, rows_a: Int64, rows_b: Int64, b_from_a: Float64, camera: Camera, settings: StartSettings
+) -> InitialPair | InitFailure:
+    """Triangulate the matches; a failure if too few have parallax."""
+    count = len(rows_a)
+    keypoints = np.stack([a.keypoints[rows_a], b.keypoints[rows_b]], axis=1).reshape(-1, 2)
+    poses = np.stack([np.eye(4), b_from_a])
+    offsets = np.arange(0, 2 * count + 1, 2)
+    result = triangulate_tracks(keypoints, np.tile([0, 1], count), offsets, poses, camera.K)
+    worst = result.errors.reshape(-1, 2).max(axis=1)
+    parallax_deg = result.parallax_deg
+    good = (
+        result.in_front & (worst <= 2.0 * settings.epipolar_error) & (parallax_deg > 0.25 * settings.min_parallax_deg)
+    )
+    if (parallax_deg[good] >= settings.min_parallax_deg).sum() < settings.min_points:
+        return InitFailure("too little parallax")
+    return InitialPair(b_from_a, rows_a[good], rows_b[good], result.points[good], parallax_deg[good])
+
+
+def _from_plane(
+    a: View, b: View, rows_a: Int64, rows_b: Int64, plane: RobustHomography, camera: Camera, settings: StartSettings
+) -> InitialPair | InitFailure:
+    """The motion over a plane that puts most points in front of both cameras, if no other comes near it."""
+    rows_a, rows_b = rows_a[plane.inliers], rows_b[plane.inliers]
+    motions = motions_of_homography(plane.b_from_a, camera)
+    tried = [_with_points(a, b, rows_a, rows_b, b_from_a, camera, settings) for b_from_a in motions]
+    pairs = sorted((pair for pair in tried if isinstance(pair, InitialPair)), key=lambda pair: -len(pair.rows_a))
+    if not pairs:
+        return InitFailure("too little parallax")
+    if len(pairs) > 1 and len(pairs[1].rows_a) > _UNIQUE_SHARE * len(pairs[0].rows_a):
+        return InitFailure("a plane with two possible motions")
+    return pairs[0]
