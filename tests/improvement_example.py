@@ -17,10 +17,10 @@ import numpy as np
 
 from improvo.evaluation.settings import SurvivalSettings
 from improvo.files import make_output_folder, write_json
+from improvo.frontend.settings import FrontendSettings
 from improvo.frontend.weights import Weights, find_weights, load_weights, save_weights
 from improvo.improvement.improve import Improvement, improve
 from improvo.improvement.settings import HeldBackSettings, ImproveSettings, JudgeSettings
-from improvo.odometry.run_settings import FrontendSettings
 from improvo.odometry.settings import OdometrySettings, StartSettings
 from improvo.stability.settings import LabelSettings
 from improvo.training.settings import OdometryTrainingSettings

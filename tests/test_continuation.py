@@ -1,4 +1,4 @@
-"""Work goes on only under the settings that it was begun with; former names, new settings and free ones are no change."""
+"""Work goes on only under the settings that it was begun with; what no result depends on may differ."""
 
 from __future__ import annotations
 

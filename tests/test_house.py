@@ -17,6 +17,7 @@ FLOORS = (
     {"evaluation"},
     {"report", "export"},
     {"improvement"},
+    {"verbs", "presets"},
     {"cli"},
 )
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}

@@ -47,8 +47,8 @@ def to_yaml(settings: Any) -> str:
     return yaml.safe_dump(to_dict(settings), sort_keys=False)
 
 
-def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = ()) -> T:
-    """Settings of type `cls` from defaults, a YAML file and `a.b=value` overrides, in that order.
+def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = (), base: T | None = None) -> T:
+    """Settings of type `cls` from defaults (or `base`, such as a preset), a YAML file and `a.b=value` overrides.
 
     Raises:
         ConfigError: a file that is no YAML mapping, an unknown key, or a value of the wrong type.
@@ -83,11 +83,11 @@ def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = ()) 
             target[_present_name(below, leaf)] = yaml.safe_load(text)
         except yaml.YAMLError:
             raise ConfigError(f"--set {override}: the value is not readable") from None
-    return from_dict(cls, merged, where=str(path) if path else "settings")
+    return from_dict(cls, merged, str(path) if path else "settings", base)
 
 
-def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings") -> T:
-    """Build the dataclass `cls` from nested dictionaries.
+def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings", base: T | None = None) -> T:
+    """Build the dataclass `cls` from nested dictionaries; what they leave out is as in `base`, or as in the defaults.
 
     Raises:
         ConfigError: an unknown key (with the nearest known one) or a value of the wrong type.
@@ -97,9 +97,11 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings") -> 
 
     values = with_present_names(values, _section_of(cls))
     _refuse_unknown_keys(cls, values, where, prefix="")
-    if all(_has_default(field) for field in dataclasses.fields(cls)):  # type: ignore[arg-type]
+    if base is None and all(_has_default(field) for field in dataclasses.fields(cls)):  # type: ignore[arg-type]
+        base = cls()
+    if base is not None:
         # a section given in part keeps what this class has for the rest of it, not the section's own defaults
-        values = over(to_dict(cls()), values)
+        values = over(to_dict(base), values)
     converter = cattrs.Converter(forbid_extra_keys=True)
     converter.register_structure_hook(bool, _strict(bool))
     converter.register_structure_hook(int, _strict(int))

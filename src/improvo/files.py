@@ -21,9 +21,13 @@ FORMER_NAME = "sivo"  # of this package; folders and weights written under it st
 
 @contextmanager
 def written_atomically(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` to write to; it replaces `path` when the block ends, and vanishes if it fails."""
+    """A temporary path beside `path` to write to; it replaces `path` when the block ends, and vanishes if it fails.
+
+    The folder is made where it is missing, so that nothing needs to be made before there is something to write.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial{path.suffix}")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
         os.replace(temporary, path)
     except OSError as error:

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_trajectory_arguments(parser)
     add_run_arguments(parser)
-    add_sequence_arguments(parser)
+    add_sequence_arguments(parser, defaults.sequence)
     add_config_arguments(parser)
 
 

@@ -9,43 +9,42 @@ continue.
 from __future__ import annotations
 
 import argparse
-import json
-from pathlib import Path
-from typing import TYPE_CHECKING
 
+from improvo.cli.flags import add_setting
 from improvo.cli.options import settings_from
-from improvo.cli.train_options import OPTIMISER_FLAGS, add_training_arguments, need_torch, starting_weights, summary
-from improvo.errors import InputError
+from improvo.cli.train_options import (
+    add_data_card,
+    add_training_arguments,
+    print_metrics,
+    read_data_card,
+    starting_weights,
+)
 from improvo.files import check_output_folder
 from improvo.training.settings import HomographiesSettings
-
-if TYPE_CHECKING:
-    from improvo.frontend.weights import DataSource
+from improvo.verbs import need_torch
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `improvo train homographies`."""
+    defaults = HomographiesSettings()
     parser.add_argument(
         "sources", nargs="+", metavar="SOURCE[=WEIGHT]", help="image folder or sequence; a higher weight is seen more"
     )
     parser.add_argument(
         "--detector", metavar="WEIGHTS", help="label the pictures with this detector: a file, or a bundled name"
     )
-    parser.add_argument(
-        "--data-card", type=Path, metavar="FILE", help="JSON list of name, licence, attribution for the model card"
+    add_data_card(parser)
+    add_setting(
+        parser, defaults, "--descriptor-loss", "descriptor_loss", help="info_nce, or hinge as SuperPoint has it"
     )
-    parser.add_argument(
-        "--descriptor-loss", default=argparse.SUPPRESS, help="info_nce, or hinge as SuperPoint has it (info_nce)"
-    )
-    add_training_arguments(parser, HomographiesSettings().optimiser)
+    add_training_arguments(parser, defaults)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Train and print where the weights are."""
-    flags = {**OPTIMISER_FLAGS, "descriptor_loss": "descriptor_loss"}
-    settings = settings_from(HomographiesSettings, arguments, flags)
+    settings = settings_from(HomographiesSettings, arguments)
     check_output_folder(arguments.output, "train homographies")
-    data = read_data_card(arguments.data_card) if arguments.data_card else ()
+    data = read_data_card(arguments.data_card)
     need_torch()
     from improvo.training.stages import train_homographies
 
@@ -57,18 +56,5 @@ def run(arguments: argparse.Namespace) -> None:
         starting_weights(arguments.detector),
         data,
     )
-    print(summary(arguments.output, metrics))
-
-
-def read_data_card(path: Path) -> tuple[DataSource, ...]:
-    """What the model card says about the pictures.
-
-    Raises:
-        InputError: not a JSON list of name, licence and attribution.
-    """
-    from improvo.frontend.weights import DataSource
-
-    try:
-        return tuple(DataSource(**entry) for entry in json.loads(path.read_text()))
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"{path}: must be a JSON list of objects with name, licence, attribution ({error})") from None
+    weights = arguments.output / "weights.safetensors"
+    print_metrics(arguments.output, metrics, f"`improvo run SEQUENCE --frontend {weights} -o out` uses them")

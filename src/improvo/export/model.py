@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from improvo.errors import InputError, OutputError
 from improvo.files import write_png
@@ -102,8 +102,15 @@ def image_name(position: int) -> str:
     return f"frame_{position:06d}.png"
 
 
-def write_images(run: RunFolder, model: Model, folder: Path) -> UInt8:
-    """Write the frames, undistorted as the run saw them; returns the grey value (P,) of each point where first seen."""
+def write_images(run: RunFolder, model: Model, folder: Path, advance: Callable[[], None] = lambda: None) -> UInt8:
+    """Write the frames, undistorted as the run saw them; returns the grey value (P,) of each point where first seen.
+
+    Args:
+        run: whose recording they come from.
+        model: whose frames.
+        folder: made if need be.
+        advance: is called after every frame.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -111,11 +118,12 @@ def write_images(run: RunFolder, model: Model, folder: Path) -> UInt8:
     grey = np.full(len(model.xyz), 128, np.uint8)
     first = np.flatnonzero(np.diff(model.point, prepend=-1))
     pixels = np.rint(model.keypoints[first]).astype(np.int64)
-    for row, position in enumerate(tqdm(model.frames.tolist(), unit="frame", desc="images", disable=None)):
+    for row, position in enumerate(model.frames.tolist()):
         image = run.image(position)
         write_png(folder / image_name(position), image[..., None].repeat(3, axis=2))
         here = np.flatnonzero(model.frame[first] == row)
         v = np.clip(pixels[here, 1], 0, image.shape[0] - 1)
         u = np.clip(pixels[here, 0], 0, image.shape[1] - 1)
         grey[model.point[first[here]]] = image[v, u]
+        advance()
     return grey

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 
 from improvo.errors import ConfigError
 from improvo.evaluation.settings import SurvivalSettings
-from improvo.odometry.run_settings import FrontendSettings, RunSettings
+from improvo.frontend.settings import FrontendSettings
+from improvo.odometry.run_settings import RunSettings
 from improvo.odometry.settings import OdometrySettings
 from improvo.sequences.base import SequenceSettings
 from improvo.stability.settings import LabelSettings

@@ -18,7 +18,7 @@ from improvo.config import to_dict
 from improvo.errors import InputError
 from improvo.files import make_output_folder, write_json
 from improvo.frontend import Frontend
-from improvo.frontend.registry import load_odometry_frontend
+from improvo.frontend.registry import frontend_from
 from improvo.jobs.interrupts import interrupts_wait
 from improvo.odometry.ahead import detected_ahead
 from improvo.odometry.ply import write_ply
@@ -72,9 +72,7 @@ def run_odometry(
         InputError: fewer than three readable frames.
         OutputError: the folder cannot be used.
     """
-    frontend = frontend or load_odometry_frontend(
-        settings.frontend.name, settings.frontend.max_keypoints, settings.frontend.least_stability
-    )
+    frontend = frontend or frontend_from(settings.frontend)
     visualizer = visualizer or NullVisualizer()
     if sequence.length is not None and sequence.length < _MIN_FRAMES:
         raise InputError(f"{sequence.path}: has {sequence.length} frames; odometry needs at least {_MIN_FRAMES}")
