@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -11,6 +10,7 @@ from types import TracebackType
 from typing import TypeVar
 
 from improvo.jobs.workers import WorkerDiedError, one_thread_each, start_worker, with_errors_sent
+from improvo.terminal import progress
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -23,7 +23,7 @@ class Workers:
 
     Args:
         count: processes; with 1 everything runs in this process.
-        progress: whether to show a progress bar on stderr.
+        progress: whether to show progress on stderr.
     """
 
     def __init__(self, count: int = 1, progress: bool = False) -> None:
@@ -56,16 +56,12 @@ class Workers:
             Exception: what the function raised for the first task that failed.
             WorkerDiedError: a process ended without an answer.
         """
-        from tqdm import tqdm
-
         queue = list(tasks)
-        with tqdm(
-            total=len(queue), desc=label, unit="task", file=sys.stderr, disable=not self._progress, leave=False
-        ) as bar:
+        with progress(label, "task", len(queue), self._progress) as shown:
             if self._count <= 1 or len(queue) <= 1:
                 for task in queue:
                     yield function(task)
-                    bar.update()
+                    shown.advance()
                 return
             with one_thread_each():  # submitting starts the processes
                 futures = [self._started().submit(with_errors_sent, function, task) for task in queue]
@@ -77,7 +73,7 @@ class Workers:
                         f"{label}: a worker process died (out of memory?); run again with fewer workers"
                     ) from None
                 yield result
-                bar.update()
+                shown.advance()
 
     def _started(self) -> ProcessPoolExecutor:
         if self._pool is None:
