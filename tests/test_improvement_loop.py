@@ -25,7 +25,7 @@ from improvo.improvement.improve import Improvement
 from improvo.improvement.judgement import Judgement, gain_interval, is_better, read_judgement, rule
 from improvo.improvement.settings import ImproveSettings, JudgeSettings
 from improvo.improvement.telling import Telling
-from improvo.labeling.labelled import read_labels
+from improvo.labeling.labeled import read_labels
 
 EXAMPLE = Path(__file__).with_name("improvement_example.py")
 LABEL_TABLES = ("tracks.parquet", "points.parquet", "frames.parquet", "trajectory.txt")

@@ -19,7 +19,7 @@ from improvo.export.model import segment_model
 from improvo.odometry.run_folder import RunFolder
 from improvo.stability.rule import IGNORE
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, read_points, read_tracks
-from labelled_scene import write_labelled_scene
+from labeled_scene import write_labeled_scene
 
 
 def as_written(path: Path) -> pa.Table:
@@ -128,16 +128,16 @@ def test_the_order_of_rows_changes_nothing_of_a_run(
 
 
 def test_the_order_of_rows_changes_nothing_that_is_trained_on(tmp_path: Path) -> None:
-    from improvo.labeling.labelled import read_labels
-    from improvo.training.labelled_frames import LabelledFrames
+    from improvo.labeling.labeled import read_labels
+    from improvo.training.labeled_frames import LabeledFrames
     from improvo.training.settings import LandmarkSettings
     from improvo.training.wrong_links import largest_step_shares
 
-    stores = [write_labelled_scene(tmp_path / name, wrong_link=True) for name in ("as-written", "reversed")]
+    stores = [write_labeled_scene(tmp_path / name, wrong_link=True) for name in ("as-written", "reversed")]
     reverse_tracks(stores[1] / "walls")
     (expected,), (found,) = (read_labels(store) for store in stores)
     np.testing.assert_array_equal(largest_step_shares(expected), largest_step_shares(found))
-    frames = [LabelledFrames(sequence, 160, LandmarkSettings()) for sequence in (expected, found)]
+    frames = [LabeledFrames(sequence, 160, LandmarkSettings()) for sequence in (expected, found)]
     for frame in (0, 7, 30):
         points = [each.points(frame) for each in frames]
         for name in ("points", "landmark", "stability", "seen"):

@@ -16,6 +16,7 @@ T = TypeVar("T")
 # Settings that were renamed: the section, what a setting there was called, and what it is called now. Files that were
 # written under a former name stay readable.
 FORMER_NAMES: dict[str, dict[str, str]] = {
+    "labels": {"second_opinion": "quality"},
     "odometry": {"initialisation": "mode", "trust": "ransac_gate"},
     "matching": {
         "max_stray": "flow_outlier_limit",

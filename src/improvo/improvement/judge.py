@@ -20,7 +20,7 @@ from improvo.improvement.held_back import Part
 from improvo.improvement.judgement import Judgement, write_judgement
 from improvo.improvement.settings import JudgeSettings
 from improvo.jobs.pool import Workers
-from improvo.labeling.labelled import LabelledSequence, read_labels
+from improvo.labeling.labeled import LabeledSequence, read_labels
 from improvo.labeling.store import DONE, SequenceRecord
 from improvo.sequences import Sequence, open_sequence
 from improvo.stability.rule import IGNORE
@@ -78,7 +78,7 @@ def _opened(path: Path, part: Part) -> Sequence | None:
         return None
 
 
-def _of_labels(labelled: list[LabelledSequence]) -> dict[str, float]:
+def _of_labels(labelled: list[LabeledSequence]) -> dict[str, float]:
     """Track length, share of stable tracks and error over the label tables."""
     observations = tracks = stable = with_label = 0
     errors = []

@@ -44,13 +44,13 @@ class SequenceRecord:
     format: str = ""
     frames: int = 0  # processed
     tracked: int = 0  # with a pose
-    trusted: int = 0  # of those, by the second opinion
+    trusted: int = 0  # of those, by the quality gate
     segments: int = 0
     tracks: int = 0
     stable: int = 0
     unstable: int = 0
     ignore: int = 0
-    withheld: int = 0  # labels that the second opinion took away
+    withheld: int = 0  # labels that the quality gate took away
     packed: bool = False
     seconds: float = 0.0
 

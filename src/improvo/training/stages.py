@@ -31,7 +31,7 @@ from improvo.training.trainer import Batches, Stage, Trainer, choose_device
 from improvo.training.widen import widen
 
 if TYPE_CHECKING:
-    from improvo.labeling.labelled import LabelledSequence
+    from improvo.labeling.labeled import LabeledSequence
 
 WEIGHTS = "weights.safetensors"
 SETTINGS = "settings.yaml"
@@ -113,8 +113,8 @@ def train_odometry(
         InputError: no store, a store whose labels have changed since the folder was begun, or no frame with enough
             stable points.
     """
-    from improvo.labeling.labelled import read_labels
-    from improvo.training.labelled_frames import LabelledFrames
+    from improvo.labeling.labeled import read_labels
+    from improvo.training.labeled_frames import LabeledFrames
     from improvo.training.tracked_pairs import TrackedPairs
     from improvo.training.vo_adaptation import VOAdaptationStage
 
@@ -124,7 +124,7 @@ def train_odometry(
     parent = load_weights(start)
     architecture = replace(without_dead_channels(parent).architecture, stability=True)
     network = _started(architecture, settings.optimiser.seed, parent)
-    frames = [LabelledFrames(sequence, settings.longer_side, settings.landmarks) for sequence in sequences]
+    frames = [LabeledFrames(sequence, settings.longer_side, settings.landmarks) for sequence in sequences]
     rehearsed, sources = _rehearsal(pictures, settings, output, progress)
     pairs = TrackedPairs(frames, settings, rehearsed)
     if not sum(len(useful) for useful in pairs.useful):
@@ -163,7 +163,7 @@ def _rehearsal(
     return PairBatches(pictures, labels, as_before), [source.name for source in pictures.sources]
 
 
-def _same_labels(path: Path, sequences: Sequence[LabelledSequence]) -> None:
+def _same_labels(path: Path, sequences: Sequence[LabeledSequence]) -> None:
     """Remember what a folder is trained on; refuse to continue it with other labels."""
     now = [[s.name, s.record.frames, s.record.tracks, s.record.stable, s.record.unstable] for s in sequences]
     record = SettingsRecord(path)

@@ -26,7 +26,7 @@ RUN_FILE, TRAJECTORY_FILE = "run.json", "trajectory.txt"
 
 
 @dataclass(frozen=True)
-class LabelledSequence:
+class LabeledSequence:
     """One finished sequence of a store; tables are read when they are first asked for."""
 
     folder: Path
@@ -94,7 +94,7 @@ class LabelledSequence:
         return lambda frame: sequence[int(rows[frame])].image
 
 
-def read_labels(folder: Path) -> list[LabelledSequence]:
+def read_labels(folder: Path) -> list[LabeledSequence]:
     """All finished sequences of a store, by name.
 
     Raises:
@@ -110,4 +110,4 @@ def read_labels(folder: Path) -> list[LabelledSequence]:
     done = [record for record in records if record.state == DONE]
     if not done:
         raise InputError(f"{folder}: has no labelled sequence; see the reasons with `improvo label`, and run it again")
-    return [LabelledSequence(folder / record.name, record, settings, rule) for record in done]
+    return [LabeledSequence(folder / record.name, record, settings, rule) for record in done]
