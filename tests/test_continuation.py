@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -43,8 +44,18 @@ def test_free_settings_may_differ(record: SettingsRecord) -> None:
     assert record.difference({**SETTINGS, "optimiser": {"seed": 1}}) == "optimiser.seed=0, now 1"
 
 
+@dataclass(frozen=True)
+class Optimiser:
+    rate: float = 0.1
+
+
+@dataclass(frozen=True)
+class ImproveSettings:
+    optimiser: Optimiser = field(default_factory=Optimiser)
+
+
 def test_a_setting_that_came_later_counts_as_having_its_default(record: SettingsRecord) -> None:
-    with_default = SettingsRecord(record.path, {"optimiser": {"rate": 0.1}}, ["optimiser.threads"])
+    with_default = SettingsRecord(record.path, ImproveSettings, ["optimiser.threads"])
     now = {**SETTINGS, "optimiser": {"seed": 0, "rate": 0.1}}
     assert record.difference(now) == "optimiser.rate=None, now 0.1"
     assert with_default.difference(now) == ""
@@ -55,6 +66,9 @@ def test_former_names_are_the_present_ones(record: SettingsRecord, monkeypatch: 
     monkeypatch.setitem(config.FORMER_NAMES, "frontend", {"max_keypoints": "most_keypoints"})
     now = {**SETTINGS, "frontend": {"name": "orb", "most_keypoints": 500}}
     record.check(now, "")
+    monkeypatch.setitem(config.FORMER_NAMES, "improve", {"frontend": "network"})  # of a whole section of one class
+    of_improve = SettingsRecord(record.path, ImproveSettings)
+    assert of_improve.read()["network"] == SETTINGS["frontend"]
     record.write(now)
     assert yaml.safe_load(record.path.read_text())["frontend"] == now["frontend"]
 

@@ -17,6 +17,7 @@ T = TypeVar("T")
 # written under a former name stay readable.
 FORMER_NAMES: dict[str, dict[str, str]] = {
     "labels": {"second_opinion": "quality"},
+    "improve": {"held_back": "split", "judge": "validation"},
     "odometry": {"initialisation": "mode", "trust": "ransac_gate"},
     "matching": {
         "max_stray": "flow_outlier_limit",
@@ -56,7 +57,7 @@ def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = (), 
     """
     import yaml
 
-    section = _section_of(cls)
+    section = section_of(cls)
     merged: dict[str, Any] = {}
     if path is not None:
         try:
@@ -96,7 +97,7 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings", bas
     import cattrs
     from cattrs.errors import ClassValidationError
 
-    values = with_present_names(values, _section_of(cls))
+    values = with_present_names(values, section_of(cls))
     _refuse_unknown_keys(cls, values, where, prefix="")
     if base is None and all(_has_default(field) for field in dataclasses.fields(cls)):  # type: ignore[arg-type]
         base = cls()
@@ -137,7 +138,7 @@ def _present_name(section: str, key: Any) -> Any:
     return FORMER_NAMES.get(section, {}).get(key, key)
 
 
-def _section_of(cls: type) -> str:
+def section_of(cls: type) -> str:
     """`odometry` for `OdometrySettings`."""
     return cls.__name__.removesuffix("Settings").lower()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +22,15 @@ class SettingsRecord:
 
     Args:
         path: of the file, YAML or `.json`.
-        defaults: settings of the same kind with their default values. A setting that the file lacks, because it came
-            with a later version, counts as having its default.
+        kind: class of the settings, if they have one. A setting that the file lacks, because it came with a later
+            version, counts as having its default.
         free: dotted names of settings that may differ, because no result depends on them.
     """
 
-    def __init__(self, path: Path, defaults: Mapping[str, Any] | None = None, free: Iterable[str] = ()) -> None:
+    def __init__(self, path: Path, kind: type | None = None, free: Iterable[str] = ()) -> None:
         self.path = path
-        self._defaults = dict(defaults or {})
+        self._defaults = config.to_dict(kind()) if kind else {}
+        self._section = config.section_of(kind) if kind else ""
         self._free = tuple(free)
 
     def read(self) -> Any:
@@ -47,7 +48,7 @@ class SettingsRecord:
             values = json.loads(text) if self.path.suffix == ".json" else yaml.safe_load(text)
         except (OSError, ValueError, yaml.YAMLError):
             raise InputError(f"{self.path}: is damaged; choose another output folder") from None
-        return config.with_present_names(values)
+        return config.with_present_names(values, self._section)
 
     def difference(self, settings: Any) -> str:
         """The first setting that differs from the record, in words; empty where none does or nothing is recorded."""

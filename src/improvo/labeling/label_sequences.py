@@ -63,7 +63,7 @@ def label_sequences(
         OutputError, ConfigError: the store cannot be used, see `LabelStore`.
     """
     names = sequence_names(list(paths))
-    store = LabelStore(folder, _fingerprint(settings, pack), relabel, _fingerprint(type(settings)(), pack=False))
+    store = LabelStore(folder, _fingerprint(settings, pack), relabel, type(settings))
     before = {record.name: record for record in store.records() if record.state == DONE}
     records = {name: before[name] for name in names if name in before}
     for name, record in records.items():

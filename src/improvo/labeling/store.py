@@ -62,7 +62,7 @@ class LabelStore:
         folder: made if need be.
         settings: everything that the labels depend on, as plain dictionaries.
         relabel: where the folder was made with other settings, clear it instead of refusing.
-        defaults: the same with default values, see `SettingsRecord`.
+        kind: class of the settings, see `SettingsRecord`.
 
     Raises:
         OutputError: the folder is not ours or cannot be written.
@@ -74,11 +74,11 @@ class LabelStore:
         folder: Path,
         settings: dict[str, Any],
         relabel: bool = False,
-        defaults: dict[str, Any] | None = None,
+        kind: type | None = None,
     ) -> None:
         check_output_folder(folder, _COMMAND)
         self.folder = folder
-        made_with = SettingsRecord(folder / SETTINGS_FILE, defaults)
+        made_with = SettingsRecord(folder / SETTINGS_FILE, kind)
         if not relabel:
             made_with.check(settings, "use another folder, or --relabel")
         elif made_with.difference(settings):

@@ -317,7 +317,7 @@ _FREE = ("steps", "decay_steps", "device", "threads", "workers", "checkpoint_min
 
 def _same_settings(path: Path, settings: StageSettings) -> None:
     """Remember the settings of the folder; refuse to continue it under others."""
-    values, defaults = config.to_dict(settings), config.to_dict(type(settings)())
-    record = SettingsRecord(path, defaults, [f"optimiser.{name}" for name in _FREE])
+    record = SettingsRecord(path, type(settings), [f"optimiser.{name}" for name in _FREE])
+    values = config.to_dict(settings)
     record.check(values, "give the same settings or another output folder")
     record.write(values)

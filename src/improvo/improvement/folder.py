@@ -5,21 +5,63 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from improvo import config
 from improvo.continuation import SettingsRecord
 from improvo.files import check_output_folder, make_output_folder
-from improvo.improvement.candidate import Candidate
 from improvo.improvement.settings import ImproveSettings
 
 COMMAND = "improve"
-# what may differ when a run is continued: none of these alters a result
+# settings of the optimiser that may differ when a run is continued: none of these alters a result
 _FREE = ("device", "threads", "workers", "checkpoint_minutes", "log_every")
 
 
-class Workspace:
+@dataclass(frozen=True)
+class Candidate:
+    """A frontend of the loop with all that is known of it: the one at the start, or one that a round has trained.
+
+    NAME/
+        weights.safetensors, .json   what it is
+        held-back/                   label store of what was held back, made with it
+        judgement.json               its `Validation`; written last
+        labels/                      label store of the training part, made with it, once it is the teacher
+        training/                    of a round: metrics and checkpoints
+        pictures/
+    """
+
+    name: str  # "start", "round 1"
+    folder: Path
+
+    @property
+    def weights(self) -> Path:
+        """Its weights file, ready for the same runtime as that of every other candidate."""
+        return self.folder / "weights.safetensors"
+
+    @property
+    def labels(self) -> Path:
+        """Label store of the training part."""
+        return self.folder / "labels"
+
+    @property
+    def held_back(self) -> Path:
+        """Label store of the part to validate on."""
+        return self.folder / "held-back"
+
+    @property
+    def training(self) -> Path:
+        """Where it was trained."""
+        return self.folder / "training"
+
+    @property
+    def validation(self) -> Path:
+        """How good it is, see `improvo.improvement.validation`."""
+        return self.folder / "judgement.json"
+
+
+class ImproveFolder:
     """OUT/
         settings.yaml          what the result depends on; other settings are refused
         split.json             which frames are trained on, and which held back
@@ -29,7 +71,8 @@ class Workspace:
 
     Args:
         folder: made if need be.
-        sequences, evaluate: as given by the user.
+        sequences: as given by the user.
+        evaluate: as given by the user.
         settings: of the loop.
         start: weights file that it starts from.
 
@@ -65,13 +108,13 @@ class Workspace:
         return Candidate("start", self.folder / "start")
 
     def round(self, number: int) -> Candidate:
-        """The frontend that a round has taught."""
+        """The frontend that a round has trained."""
         return Candidate(f"round {number}", self.folder / f"round-{number}")
 
-    def rounds_judged(self) -> int:
-        """Rounds that are complete."""
+    def finished_rounds(self) -> int:
+        """How many rounds are complete."""
         number = 0
-        while self.round(number + 1).judgement.is_file():
+        while self.round(number + 1).validation.is_file():
             number += 1
         return number
 
@@ -87,7 +130,7 @@ class Workspace:
 
     def _begin(self, values: dict[str, Any]) -> None:
         free = [f"training.optimiser.{name}" for name in _FREE]
-        record = SettingsRecord(self.folder / "settings.yaml", config.to_dict(ImproveSettings()), free)
+        record = SettingsRecord(self.folder / "settings.yaml", ImproveSettings, free)
         if self.split.is_file():
             record.check(values, "give the same again, or another output folder")
         elif record.difference(values):  # nothing has come of it yet
