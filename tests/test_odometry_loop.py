@@ -11,8 +11,8 @@ from simulated_features import CAMERA, hand_motion, nothing_to_see, observe, roo
 
 from improvo.geometry import se3
 from improvo.geometry.alignment import align_points
-from improvo.odometry.journal import FinalView
 from improvo.odometry.settings import OdometrySettings, RansacGateSettings
+from improvo.odometry.trajectory_builder import FinalView
 from improvo.odometry.view import View
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.types import Features, Float64

@@ -16,7 +16,7 @@ from improvo.odometry.run_settings import RunSettings
 
 if TYPE_CHECKING:
     from improvo.labeling.labeler import LabeledRun
-    from improvo.odometry.view import View
+    from improvo.odometry.visual_odometry import TrackedFrame
     from improvo.odometry.visualizer import Visualizer
     from improvo.sequences import Sequence
 
@@ -93,8 +93,8 @@ def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: Visu
     compile_odometry(notice)
     with progress("run", "frame", sequence.length) as shown:
 
-        def told(view: View) -> None:
-            shown.note("no pose yet" if view.cam_from_world is None else "")
+        def told(frame: TrackedFrame) -> None:
+            shown.note("no pose yet" if frame.cam_from_world is None else "")
             shown.advance()
 
         return run_and_label(sequence, folder, settings, visualizer=viewer, progress=told)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from improvo.frontend import Frontend
     from improvo.odometry.run import RunSummary
     from improvo.odometry.run_settings import RunSettings
-    from improvo.odometry.view import View
+    from improvo.odometry.visual_odometry import TrackedFrame
     from improvo.odometry.visualizer import Visualizer
     from improvo.sequences import Sequence
 
@@ -54,7 +54,7 @@ def run_and_label(
     command: str = "run",
     frontend: Frontend | None = None,
     visualizer: Visualizer | None = None,
-    progress: Callable[[View], None] | None = None,
+    progress: Callable[[TrackedFrame], None] | None = None,
 ) -> LabeledRun:
     """Track a sequence, label its tracks, and write trajectory, map, tracks, labels and report into `folder`.
 

@@ -45,11 +45,11 @@ def detected_ahead(
         return DetectedFrame(frame, matched, read - start, detected - read, time.perf_counter() - detected)
 
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="detect") as worker:
-        waiting: list[Future[DetectedFrame | None]] = [worker.submit(next_frame) for _ in range(_AHEAD)]
+        pending: list[Future[DetectedFrame | None]] = [worker.submit(next_frame) for _ in range(_AHEAD)]
         try:
-            while (detected := waiting.pop(0).result()) is not None:
-                waiting.append(worker.submit(next_frame))
+            while (detected := pending.pop(0).result()) is not None:
+                pending.append(worker.submit(next_frame))
                 yield detected
         finally:
-            for future in waiting:
+            for future in pending:
                 future.cancel()

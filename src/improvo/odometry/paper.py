@@ -1,8 +1,8 @@
 """Mode `paper`: the paper's own scheme and nothing else ("Camera Pose and Point Depth Initialization").
 
 Connect-the-dots tracks are the points; a new pose is the previous pose, a new depth is 1, and bundle adjustment with
-the depth regulariser over the last 30 consecutive poses does the rest. It is only watched: where two-view geometry
-contradicts it, the journal says so.
+the depth regulariser over the last N_last = 30 consecutive poses does the rest. The two-view check only watches: where
+it contradicts the map, an event says so, and the odometry goes on.
 """
 
 from __future__ import annotations
@@ -11,28 +11,48 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
+from improvo.odometry.events import EventLog
 from improvo.odometry.health import HealthCheck
-from improvo.odometry.journal import Journal
 from improvo.odometry.local_map import LocalMap
+from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.view import View, inherit_points
+from improvo.odometry.states import TrackingState
+from improvo.odometry.view import NO_POINT, View, inherit_points
 from improvo.odometry.window import adjust
 from improvo.types import Float64
 
 
 class PaperMapper:
-    """Gives each view a pose as the paper does; a view that leaves the window is final."""
+    """Gives each view a pose as the paper does; a view that leaves the window is final.
+
+    Args:
+        camera: pinhole camera of the views.
+        settings: of the odometry.
+        descriptor_distance: the matching threshold on unit descriptors of this frontend.
+        result: takes over what is final.
+        events: is told what went wrong.
+    """
 
     def __init__(
-        self, camera: Camera, settings: OdometrySettings, descriptor_distance: float, journal: Journal
+        self,
+        camera: Camera,
+        settings: OdometrySettings,
+        descriptor_distance: float,
+        result: OdometryResult,
+        events: EventLog,
     ) -> None:
         self._camera = camera
         self._settings = settings
         self._descriptor_distance = descriptor_distance
-        self._journal = journal
+        self._result = result
+        self._events = events
         self._map: LocalMap | None = None
         self._window: list[View] = []
-        self._health = HealthCheck(camera, settings, descriptor_distance)
+
+    @property
+    def state(self) -> TrackingState:
+        """TRACKING from the first frame on: every frame has a pose, and the map is never taken back."""
+        return TrackingState.INITIALISING if self._map is None else TrackingState.TRACKING
 
     @property
     def local_map(self) -> LocalMap | None:
@@ -42,14 +62,14 @@ class PaperMapper:
     def track(self, view: View) -> None:
         """Previous pose, unit depths, bundle adjustment over the window."""
         if self._map is not None and not self._continue(view):
-            self._journal.lost(view, len(view.observed))
+            self._events.lost(view.frame_index, len(view.observed))
+            view.forget_pose()
             self._end_segment("lost")
         if self._map is None:
-            self._map = LocalMap(self._camera, self._settings, self._descriptor_distance)
-            self._journal.started([view])
-            view.cam_from_world = np.eye(4)
+            self._map = self._begin_segment(view)
+        view.segment = view.world = self._result.running_segment
         self._window.append(view)
-        self._add_points_at_unit_depth(view)
+        self._add_points_at_unit_depth(view, self._map)
         report = adjust(
             self._window[1:],
             self._window[:1],
@@ -59,37 +79,56 @@ class PaperMapper:
             self._settings.paper_solver,
             max_error=None,
         )
-        self._journal.tracked(report)
+        self._result.add_window(report)
         if self._health.contradicts(view, {earlier.frame_index: earlier for earlier in self._window}):
-            self._journal.contradicted(view, "the mode `paper` goes on all the same")
+            self._events.contradicted(view.frame_index, "the mode `paper` goes on all the same")
         if len(self._window) > self._settings.window.paper_poses:
-            self._journal.finalise(self._window.pop(0), self._map)
+            self._finalise(self._window.pop(0), self._map)
 
     def finish(self) -> None:
         """The sequence is over: everything is final."""
         self._end_segment("end of the sequence")
 
+    def so_far(self) -> OdometryResult:
+        """The result as it would be if the sequence ended here."""
+        if self._map is None:
+            return self._result.with_running([], [])
+        posed = [(view, view.cam_from_world) for view in self._window if view.cam_from_world is not None]
+        return self._result.with_running(posed, [], self._map.store.xyz)
+
+    def _begin_segment(self, view: View) -> LocalMap:
+        """A world of its own, with nothing known of the one before."""
+        self._health = HealthCheck(self._camera, self._settings, self._descriptor_distance)
+        self._events.segment_started(view.frame_index, self._result.running_segment)
+        self._result.begin_segment()
+        view.cam_from_world = np.eye(4)
+        return LocalMap(self._camera, self._settings, self._descriptor_distance)
+
     def _continue(self, view: View) -> bool:
         """The pose of the previous view, if enough tracks go on."""
-        inherit_points(view, self._window[-1])
+        previous = self._window[-1]
+        inherit_points(view, previous)
         if len(view.observed) < self._settings.loss.min_inliers:
-            view.points[:] = -1
             return False
-        assert self._window[-1].cam_from_world is not None
-        view.cam_from_world = self._window[-1].cam_from_world.copy()
+        assert previous.cam_from_world is not None
+        view.cam_from_world = previous.cam_from_world.copy()
         return True
 
-    def _add_points_at_unit_depth(self, view: View) -> None:
-        assert self._map is not None
+    def _add_points_at_unit_depth(self, view: View, local_map: LocalMap) -> None:
         assert view.cam_from_world is not None
-        new = view.points < 0
+        new = view.points == NO_POINT
         xyz: Float64 = self._camera.unproject(view.keypoints[new], 1.0)
-        view.points[new] = self._map.store.add(se3.transform(se3.inverse(view.cam_from_world), xyz), view.frame_index)
+        world_from_cam = se3.inverse(view.cam_from_world)
+        view.points[new] = local_map.store.add(se3.transform(world_from_cam, xyz), view.frame_index)
 
     def _end_segment(self, reason: str) -> None:
         if self._map is None:
             return
         for view in self._window:
-            self._journal.finalise(view, self._map)
-        self._journal.ended(self._map, reason)
+            self._finalise(view, self._map)
+        self._result.end_segment(self._map.store.xyz, reason)
         self._map, self._window = None, []
+
+    def _finalise(self, view: View, local_map: LocalMap) -> None:
+        assert view.cam_from_world is not None
+        self._result.finalise(view, view.cam_from_world, local_map.store.xyz)

@@ -19,15 +19,15 @@ from improvo.errors import InputError
 from improvo.files import make_output_folder, write_json
 from improvo.frontend import Frontend
 from improvo.frontend.registry import frontend_from
+from improvo.geometry.trajectory_files import write_trajectory
 from improvo.jobs.interrupts import interrupts_wait
 from improvo.odometry.ahead import detected_ahead
 from improvo.odometry.ply import write_ply
 from improvo.odometry.recorder import TrackRecorder
 from improvo.odometry.run_settings import RunSettings
-from improvo.odometry.view import View
-from improvo.odometry.visual_odometry import VisualOdometry
+from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
 from improvo.odometry.visualizer import NullVisualizer, Visualizer
-from improvo.sequences import Sequence, write_trajectory
+from improvo.sequences import Sequence
 from improvo.types import Trajectory
 
 _MIN_FRAMES = 3
@@ -54,7 +54,7 @@ def run_odometry(
     command: str = "run",
     frontend: Frontend | None = None,
     visualizer: Visualizer | None = None,
-    progress: Callable[[View], None] | None = None,
+    progress: Callable[[TrackedFrame], None] | None = None,
 ) -> RunSummary:
     """Track a sequence and write its trajectory, map, tracks and report into `folder`.
 
@@ -103,7 +103,7 @@ def _track_all(
     frontend: Frontend,
     odometry: VisualOdometry,
     visualizer: Visualizer,
-    progress: Callable[[View], None] | None,
+    progress: Callable[[TrackedFrame], None] | None,
     seconds: defaultdict[str, float],
 ) -> tuple[list[int], bool]:
     """All frames in order; returns the recording's index of each processed one, and whether it was interrupted."""
@@ -112,15 +112,17 @@ def _track_all(
         for detected in detected_ahead(sequence, frontend, odometry.match):
             with interrupts_wait():
                 start = time.perf_counter()
-                view = odometry.track_matched(detected.matched, detected.frame.time)
+                tracked = odometry.track_matched(detected.matched, detected.frame.time)
                 seconds["track and adjust"] += time.perf_counter() - start
                 seconds["read"] += detected.reading
                 seconds["detect"] += detected.detecting
                 seconds["match"] += detected.matching
                 processed.append(detected.frame.source_index)
+                view = odometry.newest_view
+                assert view is not None
                 visualizer.show(detected.frame, view, odometry.running_points)
                 if progress is not None:
-                    progress(view)
+                    progress(tracked)
     except KeyboardInterrupt:
         return processed, True
     return processed, False

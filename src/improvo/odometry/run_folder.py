@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from improvo import config
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
-from improvo.sequences import Sequence, SequenceSettings, open_sequence, read_trajectory
+from improvo.geometry.trajectory_files import read_trajectory
+from improvo.sequences import Sequence, SequenceSettings, open_sequence
 from improvo.stability.rule import IGNORE
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
 from improvo.types import Float64, Int64, SparseMap, Trajectory, UInt8

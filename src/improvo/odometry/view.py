@@ -26,16 +26,24 @@ class View:
     tracks: Int64  # (N,) connect-the-dots track of each keypoint
     points: Int64  # (N,) map point of each keypoint, or NO_POINT
     cam_from_world: Float64 | None = None  # (4, 4)
+    segment: int = -1  # number of the segment that the pose belongs to; -1 without a pose
+    world: int = 0  # number of the map that the pose belongs to; it changes where a segment is started anew, too
     keyframe: bool = False
     final: bool = False
-    segment: int = -1  # number of the segment that the pose belongs to
+    # Of a keyframe: views that left the window and move along with it until it is final, with cam_from_keyframe.
     non_keyframes: list[tuple[View, Float64]] = field(default_factory=list)
-    # views that left the window and move with this keyframe until it is final, with their cam_from_keyframe
 
     @property
     def observed(self) -> Int64:
         """Rows of the keypoints that observe a map point."""
         return np.flatnonzero(self.points >= 0)
+
+    def forget_pose(self) -> None:
+        """Back to what the view was before it had a pose."""
+        self.cam_from_world = None
+        self.segment = -1
+        self.points[:] = NO_POINT
+        self.keyframe, self.non_keyframes = False, []
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -80,12 +88,22 @@ def common_tracks(a: View, b: View) -> tuple[Int64, Int64]:
 
 
 def ransac_pairs(a: View, b: View, matches: Int64, gate: RansacGateSettings) -> Mask:
-    """Which of the matches (K, 2), rows of `a` and of `b`, a RANSAC may use: those trusted at both ends."""
+    """Which matches a RANSAC may use: those whose keypoints are both likely to be stable.
+
+    Args:
+        a: the first view.
+        b: the second view.
+        matches: (K, 2) rows of `a` and of `b`.
+        gate: its settings.
+
+    Returns:
+        (K,) mask.
+    """
     return ransac_rows(np.minimum(a.weights[matches[:, 0]], b.weights[matches[:, 1]]), gate)
 
 
 def ransac_rows(weights: Float64, gate: RansacGateSettings) -> Mask:
-    """(N,) which of the weights w_ij are high enough for a RANSAC; all, where those would be too few."""
+    """(N,) which of the weights w_ij are high enough for a RANSAC; all of them, where those would be too few."""
     stable = weights >= gate.least_stability
     return stable if stable.sum() >= gate.enough else np.ones(len(weights), bool)
 

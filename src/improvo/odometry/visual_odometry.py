@@ -4,19 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from types import TracebackType
 
 import numpy as np
 
 from improvo.frontend import Frontend
 from improvo.geometry.camera import Camera
-from improvo.odometry.journal import Event, FinalView, Journal, Segment
+from improvo.odometry.events import Event, EventLog
 from improvo.odometry.paper import PaperMapper
+from improvo.odometry.result import OdometryResult
 from improvo.odometry.robust import RobustMapper
+from improvo.odometry.segments import Segment
 from improvo.odometry.settings import OdometrySettings
+from improvo.odometry.states import TrackingState
+from improvo.odometry.trajectory_builder import FinalView
 from improvo.odometry.view import View
 from improvo.tracking.connect import TrackChain
 from improvo.tracking.matching import distance_threshold, match_units, unit_descriptors, without_flow_outliers
 from improvo.types import Features, Float32, Float64, Frame, Int64, SparseMap, Trajectory
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """What is known of a frame when it has been processed; it does not change afterwards."""
+
+    frame_index: int  # in the order of processing, from 0
+    time: float  # seconds
+    cam_from_world: Float64 | None  # (4, 4), read-only; None without a pose; later frames may still refine it
+    state: TrackingState
+    segment: int  # the world and scale that the pose belongs to; -1 without a pose
+    inliers: int  # keypoints that observe a point of the map
+    keyframe: bool
 
 
 @dataclass(frozen=True)
@@ -30,6 +48,13 @@ class MatchedFeatures:
 
 class VisualOdometry:
     """Monocular visual odometry (the whole paper but its training), up to scale.
+
+    Use it as a context manager: when the block ends, all poses and points are final::
+
+        with VisualOdometry(frontend, sequence.camera) as odometry:
+            for frame in sequence:
+                odometry.track(frame)
+        print(odometry.trajectory.camera_centers, odometry.map.xyz)
 
     Args:
         frontend: gives the features of an image.
@@ -51,19 +76,34 @@ class VisualOdometry:
         self._camera = camera
         self._settings = settings or OdometrySettings()
         self._use_stability = use_stability
-        self._journal = Journal(camera, on_final)
+        self._result = OdometryResult(camera, on_final)
+        self._events = EventLog()
         self._chain = TrackChain()
-        self._previous: View | None = None
+        self._newest: View | None = None
         self._matched_before: tuple[Float32, Float32] | None = None  # keypoints, unit descriptors of the last `match`
         self._mapper: RobustMapper | PaperMapper | None = None
-        self._count = 0
+        self._finished = False
 
-    def track(self, frame: Frame) -> View:
-        """Process the next frame; its view carries the pose found so far (`cam_from_world`, None while lost)."""
+    def __enter__(self) -> VisualOdometry:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.finish()
+
+    def track(self, frame: Frame) -> TrackedFrame:
+        """Process the next frame.
+
+        Raises:
+            RuntimeError: the odometry has finished.
+        """
+        self._refuse_if_finished()
         return self.track_features(self._frontend(frame.image), frame.time)
 
-    def track_features(self, features: Features, time: float) -> View:
-        """As `track`, with the features of the frame at hand."""
+    def track_features(self, features: Features, time: float) -> TrackedFrame:
+        """As `track`, with the features of the frame and its time in seconds at hand."""
+        self._refuse_if_finished()
         return self.track_matched(self.match(features), time)
 
     def match(self, features: Features) -> MatchedFeatures:
@@ -79,59 +119,90 @@ class VisualOdometry:
         self._matched_before = features.keypoints, descriptors
         return MatchedFeatures(features, descriptors, matches)
 
-    def track_matched(self, matched: MatchedFeatures, time: float) -> View:
-        """As `track`, with the features of the frame at hand and matched."""
-        features = matched.features
+    def track_matched(self, matched: MatchedFeatures, time: float) -> TrackedFrame:
+        """As `track`, with what `match` gave for the frame and its time in seconds at hand."""
+        self._refuse_if_finished()
         view = self._extend_tracks(matched, time)
         if self._mapper is None:
             mapper = RobustMapper if self._settings.mode == "robust" else PaperMapper
-            self._mapper = mapper(self._camera, self._settings, self._max_distance(features), self._journal)
+            distance = self._max_distance(matched.features)
+            self._mapper = mapper(self._camera, self._settings, distance, self._result, self._events)
         self._mapper.track(view)
-        self._previous = view
-        self._count += 1
-        return view
+        self._newest = view
+        return TrackedFrame(
+            view.frame_index,
+            view.time,
+            _read_only(view.cam_from_world),
+            self._mapper.state,
+            view.segment,
+            len(view.observed),
+            view.keyframe,
+        )
 
     def finish(self) -> None:
-        """The sequence is over: all poses and points become final."""
-        if self._mapper is not None:
+        """The sequence is over: all poses and points become final. A second call does nothing."""
+        if self._mapper is not None and not self._finished:
             self._mapper.finish()
+        self._finished = True
+
+    @property
+    def pose(self) -> Float64 | None:
+        """The newest frame's cam_from_world (4, 4) as it is known now, in its segment's own world; None without one."""
+        return None if self._newest is None else _read_only(self._newest.cam_from_world)
+
+    @property
+    def state(self) -> TrackingState:
+        """What the odometry is doing."""
+        return TrackingState.INITIALISING if self._mapper is None else self._mapper.state
 
     @property
     def trajectory(self) -> Trajectory:
-        """Poses that are final; all of them after `finish`."""
-        return self._journal.trajectory
+        """Poses of all frames so far; those of the window may still change before `finish`."""
+        return self._so_far().trajectory
 
     @property
     def map(self) -> SparseMap:
-        """Points of finished segments; all of them after `finish`."""
-        return self._journal.map
-
-    @property
-    def running_points(self) -> Float64:
-        """(P, 3) points of the running segment, in its own world as `View.cam_from_world` is."""
-        local_map = None if self._mapper is None else self._mapper.local_map
-        return np.zeros((0, 3)) if local_map is None else local_map.store.xyz
+        """Map points of all segments so far; those of the running segment may still change before `finish`."""
+        return self._so_far().map
 
     @property
     def segments(self) -> Sequence[Segment]:
-        """Finished segments."""
-        return self._journal.segments
+        """The segments that have ended; all of them after `finish`."""
+        return tuple(self._result.segments)
 
     @property
     def events(self) -> Sequence[Event]:
-        """What went wrong where."""
-        return self._journal.events
+        """What went wrong where, in order."""
+        return tuple(self._events.events)
+
+    @property
+    def newest_view(self) -> View | None:
+        """The newest frame as the odometry itself holds it, for a visualizer; it must not be changed."""
+        return self._newest
+
+    @property
+    def running_points(self) -> Float64:
+        """(P, 3) points of the running segment, in its own world as `pose` is."""
+        local_map = None if self._mapper is None else self._mapper.local_map
+        return np.zeros((0, 3)) if local_map is None else local_map.store.xyz
+
+    def _so_far(self) -> OdometryResult:
+        return self._result if self._mapper is None or self._finished else self._mapper.so_far()
+
+    def _refuse_if_finished(self) -> None:
+        if self._finished:
+            raise RuntimeError("this odometry has finished; make a new VisualOdometry for more frames")
 
     def _extend_tracks(self, matched: MatchedFeatures, time: float) -> View:
         """Connect the dots with the previous frame."""
-        features = matched.features
-        if self._previous is None or matched.matches is None:
+        features, previous = matched.features, self._newest
+        if previous is None or matched.matches is None:
             tracks = self._chain.start(len(features))
         else:
-            tracks = self._chain.extend(self._previous.tracks, matched.matches, len(features))
+            tracks = self._chain.extend(previous.tracks, matched.matches, len(features))
         weights = features.weights() if self._use_stability else np.ones(len(features))
         return View(
-            frame_index=self._count,
+            frame_index=0 if previous is None else previous.frame_index + 1,
             time=time,
             keypoints=features.keypoints.astype(np.float64),
             descriptors=matched.descriptors,
@@ -142,3 +213,12 @@ class VisualOdometry:
 
     def _max_distance(self, features: Features) -> float:
         return distance_threshold(features, self._settings.matching.max_distance)
+
+
+def _read_only(pose: Float64 | None) -> Float64 | None:
+    """A copy that cannot be written to."""
+    if pose is None:
+        return None
+    copy = pose.copy()
+    copy.flags.writeable = False
+    return copy

@@ -1,4 +1,4 @@
-"""How the odometry shows itself: to a visualizer that is handed to it, and that may do nothing."""
+"""How the odometry shows itself: to a visualizer that is handed to it, a null object where nobody looks."""
 
 from __future__ import annotations
 
@@ -10,26 +10,32 @@ from improvo.types import Float64, Frame
 
 
 class Visualizer(Protocol):
-    """What a visualizer is told."""
+    """What a visualizer is told. It must not change what it is shown."""
 
     def begin(self, camera: Camera) -> None:
         """A run begins."""
 
     def show(self, frame: Frame, view: View, points: Float64) -> None:
-        """A frame was processed; `points` (P, 3) are the running segment's, in its own world as `view`'s pose is."""
+        """A frame was processed.
+
+        Args:
+            frame: its image.
+            view: its keypoints, tracks and pose. Poses belong together only where `view.world` is the same.
+            points: (P, 3) map points, in the world of the view's pose.
+        """
 
     def end(self) -> None:
         """The run is over."""
 
 
 class NullVisualizer:
-    """Nobody looks."""
+    """Shows nothing."""
 
     def begin(self, camera: Camera) -> None:
-        """Nothing."""
+        """Nothing to do."""
 
     def show(self, frame: Frame, view: View, points: Float64) -> None:
-        """Nothing."""
+        """Nothing to do."""
 
     def end(self) -> None:
-        """Nothing."""
+        """Nothing to do."""

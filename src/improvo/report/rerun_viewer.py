@@ -43,7 +43,7 @@ class RerunViewer:
         self._palette = palette
         self._births: dict[int, int] = {}  # track -> the frame where it began
         self._path: list[Float64] = []
-        self._segment = -1
+        self._world = -1
         self._last_shown = time.perf_counter()
 
     def begin(self, camera: Camera) -> None:
@@ -70,8 +70,8 @@ class RerunViewer:
     def _show_pose(self, view: View, points: Float64) -> None:
         assert view.cam_from_world is not None
         world_from_cam = se3.inverse(view.cam_from_world)
-        if view.segment != self._segment:
-            self._segment, self._path = view.segment, []
+        if view.world != self._world:  # another world: no line leads there
+            self._world, self._path = view.world, []
         self._path.append(world_from_cam[:3, 3])
         self._recording.pose(world_from_cam)
         self._recording.trajectory(np.array(self._path), self._palette)

@@ -1,0 +1,45 @@
+"""What the user should know about single frames: where tracking failed, and where the map was doubted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something the user should know about a frame."""
+
+    frame_index: int
+    kind: str  # "initialising", "segment", "lost" or "contradiction"
+    detail: str
+
+
+class EventLog:
+    """Collects the events of a run in order."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+        self._last_failure = ""
+
+    def segment_started(self, frame_index: int, number: int) -> None:
+        """A map has started; the first segment is not worth an event."""
+        if number > 0:
+            self._add(frame_index, "segment", f"segment {number + 1} starts: own scale, placed by guess")
+        self._last_failure = ""
+
+    def initialisation_failed(self, frame_index: int, reason: str) -> None:
+        """No map could start yet; the same reason is said once in a row."""
+        if reason != self._last_failure:
+            self._add(frame_index, "initialising", reason)
+            self._last_failure = reason
+
+    def lost(self, frame_index: int, inliers: int) -> None:
+        """A frame has no pose, because only `inliers` map points were found in it."""
+        self._add(frame_index, "lost", f"only {inliers} points of the map found")
+
+    def contradicted(self, frame_index: int, consequence: str) -> None:
+        """Fresh two-view geometry says that the map is wrong."""
+        self._add(frame_index, "contradiction", f"two-view geometry contradicts the map; {consequence}")
+
+    def _add(self, frame_index: int, kind: str, detail: str) -> None:
+        self.events.append(Event(frame_index, kind, detail))
