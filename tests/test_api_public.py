@@ -118,7 +118,7 @@ def test_match_and_a_frontend_by_name() -> None:
 
 def test_presets_are_typed_settings_and_unknown_ones_are_refused() -> None:
     paper = improvo.preset(improvo.RunSettings, "paper")
-    assert paper.labels.second_opinion.enabled is False
+    assert paper.labels.quality.enabled is False
     assert improvo.preset(improvo.OdometryTrainingSettings, "paper").pairs.wide_baselines == 0
     assert improvo.preset(improvo.ImproveSettings, "paper").training.optimiser.steps == 1000
     with pytest.raises(improvo.ConfigError, match="choose paper"):

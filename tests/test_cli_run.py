@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -115,8 +114,9 @@ def test_one_unreadable_frame_is_skipped_and_named(walk: Path, tmp_path: Path) -
     assert report["frames"]["tracked"] == 23
 
 
-@pytest.mark.skipif(not hasattr(signal, "SIGINT") or os.name == "nt", reason="needs POSIX signals")
-def test_an_interrupt_leaves_a_valid_partial_result(walk: Path, tmp_path: Path) -> None:
+@pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_leaves_a_valid_partial_result(walk: Path, tmp_path: Path, number: int) -> None:
     long = tmp_path / "long"
     long.mkdir()
     pictures = sorted(walk.glob("*.png"))
@@ -130,20 +130,17 @@ def test_an_interrupt_leaves_a_valid_partial_result(walk: Path, tmp_path: Path) 
     # a shell's background job hands SIGINT down as ignored, and Python then leaves it so
     heed_interrupts = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     with subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, preexec_fn=heed_interrupts
+        command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, preexec_fn=heed_interrupts
     ) as process:
-        assert process.stderr is not None
-        seen = b""
         deadline = time.monotonic() + 240
-        ten_or_more = re.compile(rb"run: \d{2,} of")
-        while not ten_or_more.search(seen) and time.monotonic() < deadline and process.poll() is None:
-            seen += process.stderr.read1(4096)  # type: ignore[attr-defined]
-        process.send_signal(signal.SIGINT)
-        process.stderr.read()
+        while not list(out.glob(".tracks*")) and time.monotonic() < deadline and process.poll() is None:
+            time.sleep(0.05)
+        time.sleep(2)  # some frames
+        process.send_signal(number)
         assert process.wait(timeout=120) == 130
     report = json.loads((out / "run.json").read_text())
     assert report["interrupted"] is True
-    assert 10 <= report["frames"]["processed"] < len(there_and_back)
+    assert 2 <= report["frames"]["processed"] < len(there_and_back)
     assert len(read_points(out / "points.parquet")) > 0
     assert not list(out.glob("*.partial*"))
 

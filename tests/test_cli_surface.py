@@ -80,7 +80,7 @@ def test_flags_settings_and_files_go_over_a_preset(tmp_path: Path, capsys: pytes
     assert main(["config", "run", *words]) == 0
     settings = yaml.safe_load(capsys.readouterr().out)
     assert settings["labels"]["min_observations"] == 7
-    assert settings["labels"]["second_opinion"]["enabled"] is False
+    assert settings["labels"]["quality"]["enabled"] is False
     assert settings["odometry"]["seed"] == 3
     assert main(["config", "run", "--preset", "papyrus"]) == 2
     assert "choose paper" in capsys.readouterr().err

@@ -16,6 +16,8 @@ T = TypeVar("T")
 # Settings that were renamed: the section, what a setting there was called, and what it is called now. Files that were
 # written under a former name stay readable.
 FORMER_NAMES: dict[str, dict[str, str]] = {
+    "labels": {"second_opinion": "quality"},
+    "improve": {"held_back": "split", "judge": "validation"},
     "odometry": {"initialisation": "mode", "trust": "ransac_gate"},
     "matching": {
         "max_stray": "flow_outlier_limit",
@@ -55,7 +57,7 @@ def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = (), 
     """
     import yaml
 
-    section = _section_of(cls)
+    section = section_of(cls)
     merged: dict[str, Any] = {}
     if path is not None:
         try:
@@ -95,13 +97,13 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings", bas
     import cattrs
     from cattrs.errors import ClassValidationError
 
-    values = with_present_names(values, _section_of(cls))
+    values = with_present_names(values, section_of(cls))
     _refuse_unknown_keys(cls, values, where, prefix="")
     if base is None and all(_has_default(field) for field in dataclasses.fields(cls)):  # type: ignore[arg-type]
         base = cls()
     if base is not None:
         # a section given in part keeps what this class has for the rest of it, not the section's own defaults
-        values = _over(to_dict(base), values)
+        values = over(to_dict(base), values)
     converter = cattrs.Converter(forbid_extra_keys=True)
     converter.register_structure_hook(bool, _strict(bool))
     converter.register_structure_hook(int, _strict(int))
@@ -136,33 +138,22 @@ def _present_name(section: str, key: Any) -> Any:
     return FORMER_NAMES.get(section, {}).get(key, key)
 
 
-def _section_of(cls: type) -> str:
+def section_of(cls: type) -> str:
     """`odometry` for `OdometrySettings`."""
     return cls.__name__.removesuffix("Settings").lower()
 
 
-def first_difference(before: Any, now: Any, prefix: str = "") -> str:
-    """The first setting that differs between two nested dictionaries, in words; empty where none does."""
-    if not (isinstance(before, dict) and isinstance(now, dict)):
-        return "" if before == now else f"{prefix.rstrip('.')}={before}, now {now}"
-    for key in [*before, *(key for key in now if key not in before)]:
-        difference = first_difference(before.get(key), now.get(key), f"{prefix}{key}.")
-        if difference:
-            return difference
-    return ""
-
-
-def _has_default(field: dataclasses.Field[Any]) -> bool:
-    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
-
-
-def _over(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+def over(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
     """Nested dictionaries: the values, and the defaults where there is none."""
     result = dict(defaults)
     for key, value in values.items():
         below = result.get(key)
-        result[key] = _over(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+        result[key] = over(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
     return result
+
+
+def _has_default(field: dataclasses.Field[Any]) -> bool:
+    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
 
 def _strict(kind: type) -> Any:

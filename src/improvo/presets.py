@@ -48,11 +48,11 @@ def presets(class_name: str) -> Mapping[str, Callable[[], Any]]:
 def _paper_run() -> RunSettings:
     from improvo.odometry.run_settings import RunSettings
     from improvo.odometry.settings import OdometrySettings
-    from improvo.stability.settings import LabelSettings, TrustSettings
+    from improvo.stability.settings import LabelQualitySettings, LabelSettings
 
     return RunSettings(
         odometry=OdometrySettings(mode="paper"),
-        labels=LabelSettings(second_opinion=TrustSettings(enabled=False)),
+        labels=LabelSettings(quality=LabelQualitySettings(enabled=False)),
     )
 
 

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from improvo.frontend.weights import DataSource
     from improvo.improvement.improve import Improvement
     from improvo.improvement.settings import ImproveSettings
+    from improvo.labeling.labeler import LabeledRun
     from improvo.labeling.store import SequenceRecord
-    from improvo.odometry.run import RunSummary
     from improvo.odometry.run_settings import RunSettings
     from improvo.sequences import Sequence as ImageSequence
     from improvo.sequences import SequenceSettings
@@ -33,7 +33,7 @@ def run(
     output: PathLike,
     settings: RunSettings | None = None,
     frontend: Frontend | None = None,
-) -> RunSummary:
+) -> LabeledRun:
     """Visual odometry on one sequence, as `improvo run` does it.
 
     Args:
@@ -46,14 +46,14 @@ def run(
         InputError: the sequence cannot be opened or has too few frames.
         OutputError: the folder cannot be used.
     """
-    from improvo.odometry.run import run_odometry
+    from improvo.labeling.labeler import run_and_label
     from improvo.odometry.run_settings import RunSettings
     from improvo.sequences import open_sequence
 
     settings = settings or RunSettings()
     if isinstance(sequence, str | Path):
         sequence = open_sequence(sequence, settings.sequence)
-    return run_odometry(sequence, Path(output), settings, frontend=frontend)
+    return run_and_label(sequence, Path(output), settings, frontend=frontend)
 
 
 def label(

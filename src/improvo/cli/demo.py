@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         next_step(f"open {before / 'report.html'}, or install the extra and run `improvo demo` again")
         return 0
     say("\nNow the frontend learns from the labels of this room, and is validated on the part that it never saw.")
-    held_out = ("--set", "held_back.share=0.4")  # of so short a recording, for pairs 30 frames apart
+    held_out = ("--set", "split.share=0.4")  # of so short a recording, for pairs 30 frames apart
     do("improve", recording, "-o", improved, "--frontend", arguments.frontend, "--steps", arguments.steps, *held_out)
     do("run", recording, "-o", after, "--frontend", improved / "weights.safetensors")
     do("evaluate", "trajectory", after / "trajectory.txt", truth)

@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     need_torch()
 
     from improvo.improvement.improve import improve
-    from improvo.improvement.telling import Telling, gain_words
+    from improvo.improvement.progress import ImprovementProgress, gain_words
     from improvo.odometry.compile import compile_odometry
 
     compile_odometry(notice)
@@ -83,12 +83,12 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.workers,
         arguments.ray,
         data,
-        Telling(say, progress=not output.as_json()),
+        ImprovementProgress(say, shown=not output.as_json()),
     )
     kept = result.candidates[result.best].name
     figures({"weights": str(result.weights), "best": result.best, "kept": kept}, "")
     if result.best:
-        gain = gain_words(result.judgements[result.best], result.judgements[0])
+        gain = gain_words(result.validations[result.best], result.validations[0])
         say(f"kept: {kept}, {gain} matches that survive")
     else:
         say("no round was better than the start; its weights are kept")

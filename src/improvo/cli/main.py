@@ -11,6 +11,7 @@ from improvo import __version__
 from improvo.cli import output
 from improvo.cli.commands import COMMANDS, Command
 from improvo.errors import ImprovoError
+from improvo.jobs.interrupts import termination_interrupts
 
 _EPILOG = """\
 `improvo VERB --help` shows a command's options with their defaults.
@@ -35,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         arguments = parser_for(words).parse_args(words)
-        with output.configured(arguments.quiet, getattr(arguments, "json", False)):
+        with output.configured(arguments.quiet, getattr(arguments, "json", False)), termination_interrupts():
             return int(arguments.run_command(arguments) or 0)
     except ImprovoError as error:
         print(f"improvo: {error}", file=sys.stderr)

@@ -15,7 +15,7 @@ from improvo.cli.output import figures, next_step, notice, say
 from improvo.odometry.run_settings import RunSettings
 
 if TYPE_CHECKING:
-    from improvo.odometry.run import RunSummary
+    from improvo.labeling.labeler import LabeledRun
     from improvo.odometry.visual_odometry import TrackedFrame
     from improvo.odometry.visualizer import Visualizer
     from improvo.sequences import Sequence
@@ -83,10 +83,10 @@ def _viewer(arguments: argparse.Namespace) -> Visualizer | None:
     return RerunViewer(arguments.save)
 
 
-def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: Visualizer | None) -> RunSummary:
+def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: Visualizer | None) -> LabeledRun:
     """The run with its progress."""
+    from improvo.labeling.labeler import run_and_label
     from improvo.odometry.compile import compile_odometry
-    from improvo.odometry.run import run_odometry
     from improvo.terminal import progress
 
     compile_odometry(notice)
@@ -96,16 +96,16 @@ def _track(sequence: Sequence, folder: Path, settings: RunSettings, viewer: Visu
             shown.note("no pose yet" if frame.cam_from_world is None else "")
             shown.advance()
 
-        return run_odometry(sequence, folder, settings, visualizer=viewer, progress=told)
+        return run_and_label(sequence, folder, settings, visualizer=viewer, progress=told)
 
 
-def _figures(summary: RunSummary) -> dict[str, Any]:
+def _figures(summary: LabeledRun) -> dict[str, Any]:
     report = summary.report
     names = ("frames", "segments", "points", "tracks", "events", "interrupted", "seconds", "frames_per_second")
     return {"folder": str(summary.folder), **{name: report[name] for name in names}}
 
 
-def _print_summary(summary: RunSummary) -> None:
+def _print_summary(summary: LabeledRun) -> None:
     report = summary.report
     frames, segments = report["frames"], report["segments"]
     say(

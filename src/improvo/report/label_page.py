@@ -48,7 +48,7 @@ def write_label_page(folder: Path, path: Path, palette: Palette = PALETTES["pape
     page.heading("Sequences")
     page.table(_COLUMNS, [[_words(row[name]) for name in _COLUMNS] for row in rows])
     page.paragraph(
-        "Withheld: tracks whose label the second opinion took away, because the odometry is not to be trusted where "
+        "Withheld: tracks whose label the quality gate took away, because the odometry is not to be trusted where "
         "they were seen.",
         note=True,
     )
