@@ -8,6 +8,7 @@ light: heavy imports belong inside `run`. A new command is a module and a line h
 from __future__ import annotations
 
 import importlib
+import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -35,9 +36,10 @@ class Command:
         return getattr(module, add), getattr(module, run)
 
     def description(self) -> str:
-        """What its help says: the module's own text where it has the module for itself."""
+        """What its help says: the text of its module, or of its function where the module has several."""
         name, _, part = self.module.partition(":")
-        return self.help if part else importlib.import_module(f"improvo.cli.{name}").__doc__ or self.help
+        module = importlib.import_module(f"improvo.cli.{name}")
+        return inspect.getdoc(getattr(module, f"run_{part}") if part else module) or self.help
 
 
 def settings_class(name: str) -> Any:
@@ -77,19 +79,19 @@ COMMANDS: dict[str, Command] = {
         parts={
             "shapes": Command(
                 "a detector from drawn shapes alone (MagicPoint)",
-                "train_shapes",
+                "train:shapes",
                 f"{_TRAINING}:ShapesSettings",
                 figures=True,
             ),
             "homographies": Command(
                 "detector and descriptor from any pictures, by homographic adaptation",
-                "train_homographies",
+                "train:homographies",
                 f"{_TRAINING}:HomographiesSettings",
                 figures=True,
             ),
             "odometry": Command(
                 "all three heads from labelled video: VO adaptation, the paper's stage",
-                "train_odometry",
+                "train:odometry",
                 f"{_TRAINING}:OdometryTrainingSettings",
                 figures=True,
             ),
@@ -162,7 +164,7 @@ COMMANDS: dict[str, Command] = {
             "colmap": Command("a finished run as COLMAP's sparse model, with images", "export:colmap"),
             "nerfstudio": Command("a finished run as Nerfstudio's transforms.json, with images", "export:nerfstudio"),
             "trajectory": Command("the poses of a finished run as TUM, KITTI or EuRoC file", "export:trajectory"),
-            "onnx": Command("a network with its decoding, for ONNX Runtime", "export_onnx"),
+            "onnx": Command("a network with its decoding, for ONNX Runtime", "export:onnx"),
         },
     ),
     "weights": Command(

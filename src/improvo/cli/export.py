@@ -1,4 +1,4 @@
-"""`improvo export colmap`, `nerfstudio` and `trajectory`: a finished run for other tools."""
+"""`improvo export colmap`, `nerfstudio`, `trajectory`, `onnx`: finished runs and networks for other tools."""
 
 from __future__ import annotations
 
@@ -6,14 +6,17 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from improvo.cli.flags import add_setting
 from improvo.cli.output import next_step, say
 from improvo.cli.show_options import add_recording, add_run_folder, target_path
+from improvo.errors import OutputError
 
 if TYPE_CHECKING:
     from improvo.export.model import Model
     from improvo.odometry.run_folder import RunFolder
     from improvo.types import UInt8
 
+_ONNX_SETTINGS = ("max_keypoints", "threshold", "nms_radius", "border", "subpixel_radius")
 _FILE_NAMES = {"tum": "trajectory.txt", "kitti": "poses.txt", "euroc": "data.csv"}
 
 
@@ -87,6 +90,34 @@ def run_trajectory(arguments: argparse.Namespace) -> None:
     export_trajectory(run_folder.trajectory, run_folder.frames, target, arguments.format)
     say(f"{target}: {len(run_folder.trajectory)} poses, camera-to-world, in map units")
     next_step(f"`improvo evaluate trajectory {target} TRUTH` measures them")
+
+
+def add_onnx_arguments(parser: argparse.ArgumentParser) -> None:
+    """Weights, output, and the settings of decoding, which are fixed in the file."""
+    from improvo.frontend.settings import NetworkSettings
+
+    defaults = NetworkSettings()
+    parser.add_argument("weights", metavar="WEIGHTS", help="a bundled name or a weights file")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="ONNX file to write")
+    for name in _ONNX_SETTINGS:
+        add_setting(parser, defaults, f"--{name.replace('_', '-')}", name)
+
+
+def run_onnx(arguments: argparse.Namespace) -> None:
+    """A network with its decoding as one ONNX file: image in, keypoints, descriptors and stability out."""
+    from improvo.export.onnx import export_onnx
+    from improvo.frontend.settings import NetworkSettings
+    from improvo.frontend.weights import find_weights, load_weights
+
+    given = {name: getattr(arguments, name) for name in _ONNX_SETTINGS if hasattr(arguments, name)}
+    # the move to corners works on the image beside the network, and is no part of the file
+    settings = NetworkSettings(**given, corner_radius=0)
+    if not arguments.output.parent.is_dir():
+        raise OutputError(f"{arguments.output}: no folder {arguments.output.parent}; make it first")
+    export_onnx(load_weights(find_weights(arguments.weights)), arguments.output, settings)
+    say(f"{arguments.output}: image (batch, 1, height, width) in [0, 1] -> {settings.max_keypoints} keypoints")
+    say("without the move to the image's corners (`improvo.frontend.corners`), which `improvo run` makes afterwards")
+    next_step("load it with ONNX Runtime or any other runtime")
 
 
 def _add_model_arguments(parser: argparse.ArgumentParser, contents: str) -> None:

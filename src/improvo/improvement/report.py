@@ -51,8 +51,8 @@ def write_report(
         names += f" and {len(split.training.paths) - 3} more"
     write_improvement_page(
         path,
-        "A frontend that teaches itself",
-        f"{Path(settings.frontend.name).name}, improved on {names}; judged on what it never saw, {split.words}.",
+        f"A frontend improved on {names}",
+        f"{Path(settings.frontend.name).name}, validated on what it never saw, {split.words}.",
         _measures(start, settings),
         rounds,
         _notes(candidates, validations, split, settings),
