@@ -27,7 +27,7 @@ class FramesTable:
     index: Int64  # (F,) in the recording
     time: Float64  # (F,) seconds
     segment: Int64  # (F,) -1 without a pose
-    trusted: NDArray[np.bool_]  # (F,) by the second opinion
+    trusted: NDArray[np.bool_]  # (F,) by the quality gate
 
     def __len__(self) -> int:
         return len(self.frame)

@@ -32,7 +32,7 @@ class TrackLabels:
     max_error: Float64  # (T,) pixels
     stability: NDArray[np.int8]  # (T,) IGNORE, UNSTABLE or STABLE
     parallax_deg: Float64  # (T,) largest angle between two rays from the point to cameras that saw it
-    distrusted: NDArray[np.bool_]  # (T,) a label was withheld by the second opinion (`improvo.labeling.quality`)
+    withheld: NDArray[np.bool_]  # (T,) the quality gate took its label away (`improvo.labeling.quality`); here none
     errors: Float64  # (M,) pixels, per observation; NaN where it has none
 
     def __len__(self) -> int:
@@ -42,7 +42,7 @@ class TrackLabels:
         """Number of tracks per label, and of labels withheld."""
         by_code = np.bincount(self.stability, minlength=len(STABILITY_NAMES))
         names = {name: int(by_code[code]) for code, name in enumerate(STABILITY_NAMES)}
-        return {**names, "withheld": int(self.distrusted.sum())}
+        return {**names, "withheld": int(self.withheld.sum())}
 
 
 def classify(observations: Int64, mean_error: Float64, max_error: Float64, settings: LabelSettings) -> NDArray[np.int8]:
@@ -113,7 +113,7 @@ def label_stability(
         max_error=max_error,
         stability=stability,
         parallax_deg=solved.parallax_deg,
-        distrusted=np.zeros(count, np.bool_),
+        withheld=np.zeros(count, np.bool_),
         errors=errors,
     )
 
