@@ -41,6 +41,11 @@ def write_walk(folder: Path, frames: int, seed: int = 0) -> Path:
 
 def render(cam_from_world: Float64, textures: list[UInt8]) -> UInt8:
     """Each pixel's ray meets the nearest wall; its texture is sampled there."""
+    return render_with_depth(cam_from_world, textures)[0]
+
+
+def render_with_depth(cam_from_world: Float64, textures: list[UInt8]) -> tuple[UInt8, Float64]:
+    """As `render`, and the depth Z (H, W) of each pixel in metres, inf where there is no wall."""
     columns, rows = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
     rays_cam = CAMERA.unproject(np.stack([columns, rows], axis=-1).astype(np.float64))
     world_from_cam = se3.inverse(cam_from_world)
@@ -59,7 +64,7 @@ def render(cam_from_world: Float64, textures: list[UInt8]) -> UInt8:
         sampled = cv2.remap(texture, *(hit * (_TEXTURE - 1)).astype(np.float32).transpose(2, 0, 1), cv2.INTER_LINEAR)
         image[inside] = sampled[inside]
         nearest[inside] = distance[inside]
-    return cv2.GaussianBlur(image, (3, 3), 0.6)
+    return cv2.GaussianBlur(image, (3, 3), 0.6), nearest
 
 
 def _texture(rng: np.random.Generator) -> UInt8:

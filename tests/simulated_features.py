@@ -7,7 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from improvo.geometry import se3
+from improvo.geometry.alignment import align_points
 from improvo.geometry.camera import Camera
+from improvo.odometry.view import View
+from improvo.tracking.connect import TrackChain
+from improvo.tracking.matching import match_units, unit_descriptors
 from improvo.types import Features, Float64
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
@@ -65,3 +69,44 @@ def nothing_to_see(seed: int, count: int = 200) -> Features:
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     keypoints = rng.uniform((0, 0), (CAMERA.width, CAMERA.height), (count, 2))
     return Features(keypoints.astype(np.float32), descriptors.astype(np.float32), np.ones(count, np.float32))
+
+
+def wall(count: int = 1500, seed: int = 0, depth: float = 3.0, tilt: float = 0.2) -> World:
+    """Points on one tilted plane in front of a camera at the origin."""
+    rng = np.random.default_rng(seed)
+    points = np.empty((count, 3))
+    points[:, :2] = rng.uniform(-1.0, 1.0, (count, 2)) * (1.5 * depth, 1.2 * depth)
+    points[:, 2] = depth + tilt * points[:, 0] + 0.5 * tilt * points[:, 1]
+    descriptors = rng.normal(size=(count, 32))
+    return World(points, descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True))
+
+
+def views_of(features: list[Features], first: int = 0) -> list[View]:
+    """Consecutive views with connect-the-dots tracks, without poses and points, as the odometry makes them."""
+    chain, views = TrackChain(), []
+    for i, each in enumerate(features):
+        descriptors = unit_descriptors(each)
+        if views:
+            matches = match_units(views[-1].descriptors, descriptors, 0.7)
+            tracks = chain.extend(views[-1].tracks, matches, len(each))
+        else:
+            tracks = chain.start(len(each))
+        views.append(
+            View(
+                frame_index=first + i,
+                time=(first + i) / 30.0,
+                keypoints=each.keypoints.astype(np.float64),
+                descriptors=descriptors,
+                weights=each.weights().astype(np.float64),
+                tracks=tracks,
+                points=np.full(len(each), -1, np.int64),
+            )
+        )
+    return views
+
+
+def error_percent(estimate: Float64, truth: Float64) -> float:
+    """Root mean square distance of camera centers (N, 3) after alignment with scale, as % of the path."""
+    aligned = align_points(truth, estimate, with_scale=True).apply(estimate)
+    path = np.linalg.norm(np.diff(truth, axis=0), axis=1).sum()
+    return float(100.0 * np.sqrt(((aligned - truth) ** 2).sum(axis=1).mean()) / path)

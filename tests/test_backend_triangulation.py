@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import subprocess
 import sys
@@ -161,6 +162,36 @@ def test_kernels_compile_ahead_of_time():
     assert kernels_are_cached()
     compile_kernels(said.append)
     assert said == []
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("wrong", [0, 2])
+def test_no_other_point_has_a_lower_cost(loss, wrong):
+    """Against brute force: a simplex search from the truth and from many places around it."""
+    from scipy.optimize import minimize
+
+    rng = np.random.default_rng(wrong)
+    window = simulated_window(seed=4, cameras=10, points=12, noise=0.8)
+    keypoints, camera_index, offsets, poses, K = tracks_of(window)
+    for start, end in itertools.pairwise(offsets):
+        keypoints[start : min(start + wrong, end - 3)] += rng.normal(scale=12.0, size=2)
+    settings = TriangulationSettings(loss=loss, loss_width=1.5, max_iterations=50)
+    found = triangulate_tracks(keypoints, camera_index, offsets, poses, K, settings)
+
+    for j, (start, end) in enumerate(itertools.pairwise(offsets)):
+        seen, by = keypoints[start:end], poses[camera_index[start:end]]
+
+        def cost(point, seen=seen, by=by):
+            in_camera = by[:, :3, :3] @ point + by[:, :3, 3]
+            squared = (((in_camera @ K.T)[:, :2] / in_camera[:, 2:] - seen) ** 2).sum(axis=1)
+            if loss == "geman_mcclure":
+                return (squared / (1.0 + squared / 1.5**2)).sum()
+            return np.where(squared <= 1.5**2, squared, 3.0 * np.sqrt(squared) - 1.5**2).sum()
+
+        starts = [window.points[j], *(window.points[j] + rng.normal(scale=0.3, size=(6, 3)))]
+        options = {"maxiter": 2000, "xatol": 1e-9, "fatol": 1e-9}
+        best = min(minimize(cost, x, method="Nelder-Mead", options=options).fun for x in starts)
+        assert cost(found.points[j]) <= best + 1e-3 * (1.0 + best), f"track {j}"
 
 
 def test_a_run_compiles_nothing_after_its_first_frame():

@@ -125,7 +125,8 @@ def test_an_interrupt_leaves_a_valid_partial_result(walk: Path, tmp_path: Path, 
         (long / f"{i:06d}.png").symlink_to(path)
     (long / "camera.yaml").write_bytes((walk / "camera.yaml").read_bytes())
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "improvo", "run", str(long), "-o", str(out), "--frontend", "orb"]
+    code = "import sys, improvo.cli.main as m, improvo.terminal as t; t.INTERVAL = 0; sys.exit(m.main())"
+    command = [sys.executable, "-c", code, "run", str(long), "-o", str(out), "--frontend", "orb"]
     # a shell's background job hands SIGINT down as ignored, and Python then leaves it so
     heed_interrupts = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     with subprocess.Popen(

@@ -7,9 +7,7 @@ import dataclasses
 import functools
 import io
 import json
-import os
 import re
-import signal
 import subprocess
 import sys
 import time
@@ -115,6 +113,7 @@ def test_nothing_is_made_where_the_input_is_missing(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     needed = {
+        ("train", "shapes"): 0,
         ("evaluate", "trajectory"): 2,
         ("evaluate", "stability"): 2,
         ("weights", "calibrate"): 2,
@@ -122,7 +121,7 @@ def test_nothing_is_made_where_the_input_is_missing(
     }
     inputs = [f"missing{i}" for i in range(needed.get(words, 1))]
     output = ["-o", "new/out" if words[0] not in ("weights", "export") else "out"]
-    if words[0] == "show" or words == ("report",):
+    if words[0] == "show" or words in (("report",), ("info",)):
         output = []
     if words == ("weights", "show"):
         output = []
@@ -152,6 +151,18 @@ def test_json_is_all_that_is_printed(finished_run: Path, capsys: pytest.CaptureF
     assert "\x1b" not in shown.out + shown.err  # no colours, with or without NO_COLOR
 
 
+def test_commands_that_end_in_figures_print_them_as_json(
+    finished_run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    truth = str(finished_run / "trajectory.txt")
+    assert main(["evaluate", "trajectory", str(finished_run), truth, "-o", str(tmp_path / "out"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["protocol"] == "trajectory"
+    assert main(["evaluate", "trajectory", str(finished_run), truth, "--quiet"]) == 0
+    assert "Absolute trajectory" in capsys.readouterr().out
+    for words, command in leaves():
+        assert ("--json" in help_of(words)) == command.figures
+
+
 def test_progress_is_a_line_now_and_then_where_there_is_no_terminal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -164,12 +175,8 @@ def test_progress_is_a_line_now_and_then_where_there_is_no_terminal(
     assert lines[0].startswith("label: 3 of 4 frames (75 %), ")
     assert lines[0].endswith("left")
     assert lines[1].endswith("; no pose yet")
-    terminal.be_quiet()
-    try:
-        with terminal.progress("label", "frame", 4) as shown:
-            shown.advance(4)
-    finally:
-        terminal.be_quiet(False)
+    with terminal.quiet(), terminal.progress("label", "frame", 4) as shown:
+        shown.advance(4)
     assert capsys.readouterr().err == ""
 
 
@@ -183,21 +190,3 @@ def test_settings_of_a_network_reach_the_run(tmp_path: Path, capsys: pytest.Capt
     assert config.from_dict(RunSettings, configuration).frontend.network.threads == 1
     assert main([*words, "--frontend", "orb", "--precision", "float32"]) == 2
     assert "not a network" in capsys.readouterr().err
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGINT") or os.name == "nt", reason="needs POSIX signals")
-def test_an_interrupt_is_status_130(tmp_path: Path) -> None:
-    code = (
-        "import improvo.terminal as t; t.INTERVAL = 0; from improvo.cli.main import main; import sys; sys.exit(main())"
-    )
-    words = ["run", str(bundled_sequence()), "-o", str(tmp_path / "out"), "--frontend", "orb"]
-    heed_interrupts = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    with subprocess.Popen(
-        [sys.executable, "-c", code, *words], stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts
-    ) as process:
-        assert process.stderr is not None
-        for line in process.stderr:
-            if line.startswith("run: 2"):
-                process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=120) == 130
-    assert json.loads((tmp_path / "out" / "run.json").read_text())["interrupted"] is True

@@ -12,7 +12,7 @@ import pytest
 from improvo.cli.main import main
 from improvo.errors import InputError
 from improvo.evaluation.homography.pairs import hpatches_scenes, open_scene, picture_scenes
-from improvo.evaluation.homography.protocol import average_precision, evaluate_pair
+from improvo.evaluation.homography.protocol import evaluate_pair, matching_precision
 from improvo.evaluation.settings import HomographySettings
 from improvo.training.views import inside, warp_points
 from improvo.types import Features, Float64
@@ -82,7 +82,7 @@ def test_average_precision_of_a_known_ranking() -> None:
     similarity = np.array([[0.9, 0.1], [0.8, 0.2], [0.3, 0.7], [0.1, 0.6]])
     near = np.array([[True, False], [False, True], [False, True], [False, False]])
     # ranked: right, wrong, right, wrong; three points have a partner
-    assert average_precision(similarity, near) == pytest.approx((1.0 + 2 / 3) / 3)
+    assert matching_precision(similarity, near) == pytest.approx((1.0 + 2 / 3) / 3)
 
 
 def checkered(seed: int, size: tuple[int, int]) -> np.ndarray:

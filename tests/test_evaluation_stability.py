@@ -12,8 +12,9 @@ import pytest
 from improvo.cli.main import main
 from improvo.errors import InputError
 from improvo.evaluation.stability.causes import PRECEDENCE, TrueCauses, track_causes
-from improvo.evaluation.stability.protocol import average_precision, median_errors, paired_folders, roc_auc
+from improvo.evaluation.stability.protocol import median_errors, paired_folders, roc_auc
 from improvo.evaluation.stability.true_errors import true_track_errors
+from improvo.evaluation.statistics import average_precision
 from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import inverse, rigid, transform
 from improvo.simulation import bundled_sequence

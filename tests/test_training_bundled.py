@@ -8,9 +8,9 @@ import pytest
 
 from improvo.frontend.network import load_network_frontend
 from improvo.frontend.weights import BUNDLED, bundled_names, load_weights
-from improvo.training.precision import ScoredDetector, classical_detectors, mean_average_precision, shape_tests
 from improvo.training.settings import PhotometricSettings
 from improvo.types import Float32, UInt8
+from shape_detection import ScoredDetector, classical_detectors, mean_average_precision, shape_tests
 
 NAMES = [name for name in ("superpoint", "superpoint-small") if name in bundled_names()]
 FORBIDDEN = ("redkitchen", "hololens", "checkerboard", "kitti")

@@ -4,11 +4,10 @@ The API is as short as the paper::
 
     sequence = improvo.open_sequence("video.mp4", camera="camera.yaml")
     frontend = improvo.load_frontend("superpoint-vo")
-    odometry = improvo.VisualOdometry(frontend, sequence.camera)
-    for frame in sequence:
-        odometry.track(frame)
-    odometry.finish()
-    print(odometry.trajectory, odometry.map)
+    with improvo.VisualOdometry(frontend, sequence.camera) as odometry:
+        for frame in sequence:
+            odometry.track(frame)
+    print(odometry.trajectory.camera_centers, odometry.map.xyz)
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from improvo.odometry.run_folder import RunFolder
     from improvo.odometry.run_settings import LabelRunSettings, RunSettings
     from improvo.odometry.settings import OdometrySettings
-    from improvo.odometry.visual_odometry import VisualOdometry
+    from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
     from improvo.presets import preset
     from improvo.sequences import Sequence, SequenceSettings, open_sequence
     from improvo.stability.rule import label_stability
@@ -50,6 +49,7 @@ _PUBLIC = {
     "Features": "improvo.types",
     "Tracks": "improvo.types",
     "VisualOdometry": "improvo.odometry.visual_odometry",
+    "TrackedFrame": "improvo.odometry.visual_odometry",
     "Trajectory": "improvo.types",
     "SparseMap": "improvo.types",
     "RunFolder": "improvo.odometry.run_folder",
@@ -108,6 +108,7 @@ __all__ = [
     "Sequence",
     "SequenceSettings",
     "SparseMap",
+    "TrackedFrame",
     "Tracks",
     "Trajectory",
     "TrajectorySettings",

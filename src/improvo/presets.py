@@ -46,21 +46,15 @@ def presets(class_name: str) -> Mapping[str, Callable[[], Any]]:
 
 
 def _paper_run() -> RunSettings:
-    from improvo.odometry.run_settings import RunSettings
-    from improvo.odometry.settings import OdometrySettings
-    from improvo.stability.settings import LabelQualitySettings, LabelSettings
+    from improvo.odometry.run_settings import paper_run_settings
 
-    return RunSettings(
-        odometry=OdometrySettings(mode="paper"),
-        labels=LabelSettings(quality=LabelQualitySettings(enabled=False)),
-    )
+    return paper_run_settings()
 
 
 def _paper_label() -> LabelRunSettings:
-    from improvo.odometry.run_settings import LabelRunSettings
+    from improvo.odometry.run_settings import LabelRunSettings, paper_run_settings
 
-    paper = _paper_run()
-    return LabelRunSettings(odometry=paper.odometry, labels=paper.labels)
+    return paper_run_settings(LabelRunSettings())
 
 
 def _paper_training() -> OdometryTrainingSettings:

@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
+
+T = TypeVar("T")
 
 INTERVAL = 20.0  # seconds between two lines, where there is no terminal
 _quiet = False
 
 
-def be_quiet(quiet: bool = True) -> None:
-    """Show no progress from here on, or show it again."""
+@contextmanager
+def quiet(quiet: bool = True) -> Iterator[None]:
+    """Show no progress within; `quiet` False shows it."""
     global _quiet
-    _quiet = quiet
+    before, _quiet = _quiet, quiet
+    try:
+        yield
+    finally:
+        _quiet = before
 
 
 class Progress:
@@ -53,15 +60,12 @@ def progress(words: str, unit: str, total: int | None = None, shown: bool = True
         yield _Lines(words, unit, total, done, sys.stderr)
 
 
-def line(text: str) -> None:
-    """Print a line of results past the bars."""
-    if "tqdm" not in sys.modules:
-        print(text, flush=True)
-        return
-    from tqdm import tqdm
-
-    with tqdm.external_write_mode():
-        print(text, flush=True)
+def each(items: Collection[T], words: str, unit: str, shown: bool = True) -> Iterator[T]:
+    """The items, with the progress of the loop over them; arguments as `progress`."""
+    with progress(words, unit, len(items), shown) as told:
+        for item in items:
+            yield item
+            told.advance()
 
 
 class _Bar(Progress):

@@ -17,7 +17,7 @@ import math
 import numpy as np
 
 from improvo.compiled import compiled, inlined
-from improvo.geometry.projection_kernels import inverse_depth, point_in_camera
+from improvo.geometry.projection_kernels import huber, inverse_depth, point_in_camera, residual
 
 
 @inlined
@@ -30,15 +30,6 @@ def depth_excess(constants, z):
     return 0.0
 
 
-@inlined
-def huber(squared_norm, width):
-    """rho(s) and its slope rho'(s)."""
-    if squared_norm <= width * width:
-        return squared_norm, 1.0
-    norm = math.sqrt(squared_norm)
-    return 2.0 * width * norm - width * width, width / norm
-
-
 @compiled
 def evaluate(constants, observations, poses, points):
     """The objective Omega."""
@@ -47,8 +38,9 @@ def evaluate(constants, observations, poses, points):
         for o in range(observations.first[j], observations.first[j + 1]):
             x, y, z = point_in_camera(poses[observations.camera[o]], points[j])
             scale = inverse_depth(z)
-            u = constants.fx * (x * scale) + constants.cx - observations.keypoints[o, 0]
-            v = constants.fy * (y * scale) + constants.cy - observations.keypoints[o, 1]
+            u, v = residual(
+                observations.keypoints[o], x, y, scale, constants.fx, constants.fy, constants.cx, constants.cy
+            )
             excess = depth_excess(constants, z)
             squared_norm = u * u + v * v + constants.depth_weight * (excess * excess)
             total += observations.weights[o] * huber(squared_norm, constants.huber_width)[0]
@@ -64,8 +56,9 @@ def errors_and_depths(constants, observations, poses, points):
         for o in range(observations.first[j], observations.first[j + 1]):
             x, y, z = point_in_camera(poses[observations.camera[o]], points[j])
             scale = inverse_depth(z)
-            u = constants.fx * (x * scale) + constants.cx - observations.keypoints[o, 0]
-            v = constants.fy * (y * scale) + constants.cy - observations.keypoints[o, 1]
+            u, v = residual(
+                observations.keypoints[o], x, y, scale, constants.fx, constants.fy, constants.cx, constants.cy
+            )
             errors[observations.order[o]] = math.hypot(u, v)
             depths[observations.order[o]] = z
     return errors, depths
@@ -75,8 +68,7 @@ def errors_and_depths(constants, observations, poses, points):
 def in_camera_frame(constants, x, y, z, keypoint, weight):
     """Gradient (3,) and Hessian A (xx, xz, yy, yz, zz; it has no xy) of half the observation's cost by x, y, z."""
     scale = inverse_depth(z)
-    u = constants.fx * (x * scale) + constants.cx - keypoint[0]
-    v = constants.fy * (y * scale) + constants.cy - keypoint[1]
+    u, v = residual(keypoint, x, y, scale, constants.fx, constants.fy, constants.cx, constants.cy)
     excess = depth_excess(constants, z)
     stiffness = constants.depth_weight if excess != 0.0 else 0.0
     # the residuals' derivatives are (du_x, 0, du_z), (0, dv_y, dv_z) and, for the excess, (0, 0, 1)

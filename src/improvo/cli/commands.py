@@ -23,6 +23,7 @@ class Command:
     help: str
     module: str = ""  # under improvo.cli; empty where there are sub-verbs
     settings: str = ""  # `module:class` that --config, --set and --preset speak of
+    figures: bool = False  # it ends in figures, which --json prints for programs
     parts: Mapping[str, Command] = field(default_factory=dict)
     part_name: str = "WHAT"  # of the sub-verb, in the usage
 
@@ -59,29 +60,38 @@ _TRAINING = "improvo.training.settings"
 
 COMMANDS: dict[str, Command] = {
     "run": Command(
-        "visual odometry on one sequence: trajectory, map, tracks", "run", "improvo.odometry.run_settings:RunSettings"
+        "visual odometry on one sequence: trajectory, map, tracks",
+        "run",
+        "improvo.odometry.run_settings:RunSettings",
+        figures=True,
     ),
     "label": Command(
         "stability labels for many sequences: odometry, then the paper's rule",
         "label",
         "improvo.odometry.run_settings:LabelRunSettings",
+        figures=True,
     ),
     "train": Command(
         "teach the network: drawn shapes, homographies, labelled video",
         part_name="STAGE",
         parts={
             "shapes": Command(
-                "a detector from drawn shapes alone (MagicPoint)", "train_shapes", f"{_TRAINING}:ShapesSettings"
+                "a detector from drawn shapes alone (MagicPoint)",
+                "train_shapes",
+                f"{_TRAINING}:ShapesSettings",
+                figures=True,
             ),
             "homographies": Command(
                 "detector and descriptor from any pictures, by homographic adaptation",
                 "train_homographies",
                 f"{_TRAINING}:HomographiesSettings",
+                figures=True,
             ),
             "odometry": Command(
                 "all three heads from labelled video: VO adaptation, the paper's stage",
                 "train_odometry",
                 f"{_TRAINING}:OdometryTrainingSettings",
+                figures=True,
             ),
         },
     ),
@@ -89,6 +99,7 @@ COMMANDS: dict[str, Command] = {
         "the main job: label video, train the frontend with the labels, keep it if it got better",
         "improve",
         "improvo.improvement.settings:ImproveSettings",
+        figures=True,
     ),
     "evaluate": Command(
         "how good a frontend or a trajectory is: the paper's protocols",
@@ -98,26 +109,36 @@ COMMANDS: dict[str, Command] = {
                 "3D-to-2D pose estimation, the paper's Table 1, for any frontends",
                 "evaluate_pose",
                 f"{_EVALUATION}:PoseCommandSettings",
+                figures=True,
             ),
             "trajectory": Command(
                 "a trajectory file against the truth: sub-trajectory errors, ATE",
                 "evaluate_trajectory",
                 f"{_EVALUATION}:TrajectoryCommandSettings",
+                figures=True,
             ),
             "vo": Command(
                 "visual odometry with and without stability weights, the paper's Table 2",
                 "evaluate_vo",
                 f"{_EVALUATION}:VoCommandSettings",
+                figures=True,
             ),
             "homography": Command(
                 "repeatability and homography accuracy on image pairs",
                 "evaluate_homography",
                 f"{_EVALUATION}:HomographyCommandSettings",
+                figures=True,
             ),
             "stability": Command(
-                "instability of labels and heads against its true cause, simulated", "evaluate_stability"
+                "instability of labels and heads against its true cause, simulated", "evaluate_stability", figures=True
             ),
         },
+    ),
+    "truth": Command(
+        "reference poses and camera of a recording by structure from motion",
+        "truth",
+        "improvo.evaluation.truth.settings:TruthCommandSettings",
+        figures=True,
     ),
     "show": Command(
         "the pictures of the paper, from a run, a recording or an evaluation",
@@ -161,6 +182,7 @@ COMMANDS: dict[str, Command] = {
         "what a recording was recognised as, and what is wrong with it",
         "info",
         "improvo.sequences.settings:InfoSettings",
+        figures=True,
     ),
     "calibrate": Command("a camera from a recording of a board, and the board to print", "calibrate"),
     "simulate": Command(

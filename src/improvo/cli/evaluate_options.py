@@ -7,12 +7,18 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from improvo.errors import MissingExtraError
+from improvo.errors import ConfigError, MissingExtraError
 
 if TYPE_CHECKING:
-    from improvo.evaluation.sources import FeatureSource, LoadedFrontend
+    from improvo.evaluation.sources import FeatureSource, LoadedFrontend, Recorded
+    from improvo.sequences.base import SequenceSettings
 
 DEFAULT_FRONTENDS = ["sift", "orb", "akaze"]
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def add_frontend_arguments(parser: argparse.ArgumentParser, max_keypoints: int) -> None:
@@ -35,16 +41,47 @@ def add_frontend_arguments(parser: argparse.ArgumentParser, max_keypoints: int) 
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     """Seed, processes, output folder."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     parser.add_argument("--seed", type=int, default=argparse.SUPPRESS, help="of all random choices (default: 0)")
-    parser.add_argument("--workers", type=int, default=cores, metavar="N", help="processes")
+    parser.add_argument("--workers", type=int, default=available_cores(), metavar="N", help="processes")
     parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="folder for the results")
+
+
+def add_truth_argument(parser: argparse.ArgumentParser) -> None:
+    """Which true poses replace those of the sequences."""
+    parser.add_argument(
+        "--truth",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="true poses instead of the sequence's own: a file of `improvo truth`, a TUM trajectory or the folder of a "
+        "COLMAP model, whose camera is used too; one for each SEQUENCE, in their order",
+    )
+
+
+def recorded_sequences(arguments: argparse.Namespace, settings: SequenceSettings) -> list[Recorded]:
+    """The sequences of the command line, each with its `--truth`.
+
+    Raises:
+        ConfigError: another number of `--truth` than of sequences.
+    """
+    from improvo.evaluation.sources import Recorded
+
+    paths, truths = arguments.sequences, arguments.truth
+    if truths and len(truths) != len(paths):
+        raise ConfigError(f"--truth: {len(truths)} given for {len(paths)} sequences; give one for each, or none")
+    chosen: list[str | None] = truths or [None] * len(paths)
+    return [Recorded(str(path), settings, truth) for path, truth in zip(paths, chosen, strict=True)]
 
 
 def loaded_frontends(
     asked: list[str] | None, max_keypoints: int, default: list[str] | None = None
 ) -> tuple[list[LoadedFrontend], list[dict[str, str]]]:
     """The frontends of the command line, each loaded once so that a wrong name fails before any work.
+
+    Args:
+        asked: `--frontend` of the command line.
+        max_keypoints: per image.
+        default: names where none is asked for; None are the usual ones.
 
     Returns:
         The frontends, and those of `all` that cannot run here, with the reason.
@@ -77,6 +114,11 @@ def loaded_frontends(
 
 def exported_features(asked: list[str], max_keypoints: int, one_sequence: bool) -> list[FeatureSource]:
     """The `--features` of the command line, each looked into once.
+
+    Args:
+        asked: `[LABEL=]PATH` of each.
+        max_keypoints: per image.
+        one_sequence: whether the run has a single sequence.
 
     Raises:
         InputError: nothing exported there.

@@ -9,11 +9,13 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments
+from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments, add_truth_argument
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.output import figures, next_step, say
 from improvo.errors import ImprovoError, InputError
 from improvo.evaluation.settings import ESTIMATORS, SAMPLINGS, PoseCommandSettings, PoseSettings
 
@@ -30,6 +32,7 @@ _FLAGS = {
     "depth_sampling": "pose.depth_sampling",
     "max_keypoints": "pose.max_keypoints",
     "seed": "pose.seed",
+    "shuffles": "pose.shuffles",
 }
 
 
@@ -37,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `improvo evaluate pose`."""
     defaults, absent = PoseSettings(), argparse.SUPPRESS
     parser.add_argument("sequences", nargs="*", type=Path, metavar="SEQUENCE", help="with depth and true poses")
+    add_truth_argument(parser)
     add_frontend_arguments(parser, defaults.max_keypoints)
     parser.add_argument(
         "--features",
@@ -62,6 +66,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--depth-sampling", choices=SAMPLINGS, default=absent, help=f"(default: {defaults.depth_sampling})"
     )
+    parser.add_argument(
+        "--shuffles",
+        type=int,
+        default=absent,
+        metavar="N",
+        help=f"mean over so many orders of each pair's matches, which takes noise away (default: {defaults.shuffles})",
+    )
     parser.add_argument("--per-sequence", action="store_true", help="print the table of each sequence too")
     parser.add_argument("--from", dest="results", type=Path, metavar="POSE.JSON", help="print an earlier run again")
     parser.add_argument("--export-images", type=Path, metavar="DIR", help="write the frames of all pairs, and stop")
@@ -72,11 +83,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int | None:
     """Evaluate, or print again; leaves pose.json, pose.md, curves and pairs.parquet in the output folder."""
-    from improvo.evaluation.tables import pose_tables
+    from improvo.evaluation.pose.tables import pose_tables
 
     if arguments.results is not None:
         results = read_results(arguments.results)
-        print(pose_tables(results, arguments.per_sequence), end="")
+        figures(results, pose_tables(results, arguments.per_sequence))
         _draw(results, arguments.results.parent if arguments.output is None else arguments.output)
         return 0
     if not arguments.sequences:
@@ -84,7 +95,9 @@ def run(arguments: argparse.Namespace) -> int | None:
     if arguments.export_images is not None:
         return _export(arguments)
     results = _evaluate(arguments)
-    print(pose_tables(results, arguments.per_sequence), end="")
+    figures(results, pose_tables(results, arguments.per_sequence))
+    if arguments.output is not None:
+        next_step(f"`improvo report {arguments.output}` makes a page of it")
     return 0
 
 
@@ -108,13 +121,13 @@ def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     from improvo.cli.evaluate_options import exported_features, loaded_frontends
     from improvo.evaluation.pose.results import results, write_records
     from improvo.evaluation.pose.run import run_pose_protocol
-    from improvo.files import make_output_folder, write_json
+    from improvo.files import check_output_folder, make_output_folder, write_json
     from improvo.jobs.pool import Workers
 
     settings, sources = _settings(arguments)
     output: Path | None = arguments.output
     if output is not None:
-        make_output_folder(output, COMMAND)
+        check_output_folder(output, COMMAND)
     default: list[str] | None = [] if arguments.features else None
     loaded, skipped = loaded_frontends(arguments.frontend, settings.max_keypoints, default)
     exported = exported_features(arguments.features, settings.max_keypoints, one_sequence=len(sources) == 1)
@@ -124,6 +137,8 @@ def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         earlier = read_results(output / "pose.json")
         if earlier.get("request") == json.loads(json.dumps(request)):
             return earlier
+    if output is not None:
+        make_output_folder(output, COMMAND)
     with (
         tempfile.TemporaryDirectory(prefix="improvo-") as temporary,
         Workers(arguments.workers, progress=True) as workers,
@@ -146,10 +161,10 @@ def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _settings(arguments: argparse.Namespace) -> tuple[PoseSettings, list[Recorded]]:
-    from improvo.evaluation.sources import Recorded
+    from improvo.cli.evaluate_options import recorded_sequences
 
     settings = settings_from(PoseCommandSettings, arguments, _FLAGS)
-    return settings.pose, [Recorded(str(path), settings.sequence) for path in arguments.sequences]
+    return settings.pose, recorded_sequences(arguments, settings.sequence)
 
 
 def _request(settings: PoseSettings, sources: list[Recorded], frontends: list[FeatureSource]) -> dict[str, Any]:
@@ -157,15 +172,23 @@ def _request(settings: PoseSettings, sources: list[Recorded], frontends: list[Fe
     from improvo.config import to_dict
     from improvo.evaluation.sources import sequence_fingerprint
 
+    truths = {source.open().name: _poses_digest(source) for source in sources if source.truth is not None}
     return {
         "settings": to_dict(settings),
         "sequences": [sequence_fingerprint(source, source.open()) for source in sources],
+        **({"truth": truths} if truths else {}),
         "frontends": [{"label": frontend.label, **frontend.fingerprint()} for frontend in frontends],
     }
 
 
+def _poses_digest(source: Recorded) -> int:
+    truth = source.open().ground_truth
+    assert truth is not None
+    return zlib.crc32(truth.world_from_cam.tobytes())
+
+
 def _write_text(results: dict[str, Any], output: Path) -> None:
-    from improvo.evaluation.tables import pose_tables
+    from improvo.evaluation.pose.tables import pose_tables
     from improvo.files import write_text
 
     write_text(output / "pose.md", pose_tables(results, sequences=len(results["sequences"]) > 1))
@@ -201,5 +224,5 @@ def _export(arguments: argparse.Namespace) -> int:
             with written_atomically(folder / f"{frame.source_index:06d}.png") as temporary:
                 cv2.imwrite(str(temporary), frame.image)
             written += 1
-    print(f"{written} images in {arguments.export_images}; export features as SEQUENCE/NUMBER.npz beside or elsewhere")
+    say(f"{written} images in {arguments.export_images}; export features as SEQUENCE/NUMBER.npz beside or elsewhere")
     return 0

@@ -9,6 +9,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from improvo.cli.output import figures, next_step
+
 COMMAND = "evaluate stability"
 
 
@@ -17,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("labels", type=Path, metavar="LABELS", help="folder with points.parquet and tracks.parquet")
     parser.add_argument("simulation", type=Path, metavar="SIMULATION", help="folder made by `improvo simulate`")
     parser.add_argument(
-        "--frontend", action="append", default=[], metavar="NAME", help="also judge this stability head; repeatable"
+        "--frontend", action="append", default=[], metavar="NAME", help="also measure this stability head; repeatable"
     )
     parser.add_argument("--max-keypoints", type=int, default=500, metavar="N", help="of a frontend, per image")
     parser.add_argument("--every", type=int, default=10, metavar="N", help="frames between those shown to a frontend")
@@ -29,10 +31,10 @@ def run(arguments: argparse.Namespace) -> int:
     from improvo import __version__
     from improvo.errors import ConfigError
     from improvo.evaluation.stability.protocol import (
-        Judged,
-        judge_frontend,
-        judge_labels,
+        ScoredPoints,
         paired_folders,
+        score_head,
+        score_labels,
         stability_table,
         summarise,
     )
@@ -43,25 +45,26 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.output is not None:
         check_output_folder(arguments.output, COMMAND)
     pairs = paired_folders(arguments.labels, arguments.simulation)
-    judged = {"labels": Judged.joined(judge_labels(labels, simulation) for labels, simulation in pairs)}
+    scored = {"labels": ScoredPoints.joined(score_labels(labels, simulation) for labels, simulation in pairs)}
     for name in arguments.frontend:
         from improvo.frontend.registry import load_frontend
 
         frontend = load_frontend(name, max_keypoints=arguments.max_keypoints)
-        judged[name] = Judged.joined(judge_frontend(frontend, simulation, arguments.every) for _, simulation in pairs)
+        scored[name] = ScoredPoints.joined(score_head(frontend, simulation, arguments.every) for _, simulation in pairs)
     results = {
         "protocol": "stability",
         "improvo": __version__,
         "pairs": [{"labels": str(labels), "simulation": str(simulation)} for labels, simulation in pairs],
-        "subjects": [{"name": name, **summarise(points)} for name, points in judged.items()],
+        "subjects": [{"name": name, **summarise(points)} for name, points in scored.items()],
     }
     text = stability_table(results)
-    print(text)
+    figures(results, text)
     if arguments.output is not None:
         from improvo.evaluation.stability.plot import draw_stability
 
         make_output_folder(arguments.output, COMMAND)
         write_json(arguments.output / "stability.json", results)
         write_text(arguments.output / "stability.md", text)
-        draw_stability(judged, results, arguments.output / "stability.png")
+        draw_stability(scored, results, arguments.output / "stability.png")
+        next_step(f"`improvo report {arguments.output}` makes a page of it")
     return 0

@@ -1,7 +1,7 @@
 """A trajectory against the truth (Zhang and Scaramuzza 2018): absolute error, relative errors over sub-trajectories.
 
 ESTIMATE is a TUM, KITTI or EuRoC file, or the output folder of `improvo run`; TRUTH such a file, or a sequence that has
-true poses. Segments of an estimate (`# segment N` lines) are aligned each on its own.
+true poses or gets them by --truth. Segments of an estimate (`# segment N` lines) are aligned each on its own.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.output import figures, next_step
 from improvo.errors import InputError
 from improvo.evaluation.settings import ALIGNMENTS, TrajectoryCommandSettings, TrajectorySettings
 from improvo.sequences.base import SequenceSettings
@@ -31,7 +32,13 @@ TRAJECTORY_FLAGS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `improvo evaluate trajectory`."""
     parser.add_argument("estimate", type=Path, metavar="ESTIMATE")
-    parser.add_argument("truth", type=Path, metavar="TRUTH")
+    parser.add_argument("against", type=Path, metavar="TRUTH")
+    parser.add_argument(
+        "--truth",
+        metavar="FILE",
+        help="TRUTH is a sequence, and these are its true poses: a file of `improvo truth`, a TUM trajectory or the "
+        "folder of a COLMAP model",
+    )
     add_trajectory_arguments(parser)
     parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="folder for trajectory.json and trajectory.md")
     add_sequence_arguments(parser)
@@ -72,44 +79,60 @@ def run(arguments: argparse.Namespace) -> int | None:
     from improvo.config import to_dict
     from improvo.evaluation.trajectory.protocol import evaluate_trajectory
     from improvo.evaluation.trajectory.tables import trajectory_tables
-    from improvo.files import make_output_folder, write_json, write_text
+    from improvo.files import check_output_folder, make_output_folder, write_json, write_text
 
     command = settings_from(TrajectoryCommandSettings, arguments, TRAJECTORY_FLAGS)
     settings = command.trajectory
     if arguments.output is not None:
-        make_output_folder(arguments.output, COMMAND)
-    estimate, truth, notes = read_pair(arguments.estimate, arguments.truth, command.sequence)
-    errors = evaluate_trajectory(estimate, truth, settings, (str(arguments.estimate), str(arguments.truth)))
+        check_output_folder(arguments.output, COMMAND)
+    estimate, truth, notes = read_pair(arguments.estimate, arguments.against, command.sequence, arguments.truth)
+    errors = evaluate_trajectory(estimate, truth, settings, (str(arguments.estimate), str(arguments.against)))
     result = {
         "protocol": "trajectory",
         "estimate": str(arguments.estimate),
-        "truth": str(arguments.truth),
+        "truth": arguments.truth or str(arguments.against),
         "settings": to_dict(settings),
         **to_dict(errors),
         "notes": list(notes),
     }
     text = trajectory_tables(result, arguments.estimate.name)
-    print(text + "".join(f"\n{note}" for note in notes), end="\n" if notes else "")
+    figures(result, text + "".join(f"\n{note}" for note in notes))
     if arguments.output is not None:
+        make_output_folder(arguments.output, COMMAND)
         write_json(arguments.output / "trajectory.json", result)
         write_text(arguments.output / "trajectory.md", text)
+        next_step(f"`improvo report {arguments.output}` makes a page of it")
     return 0
 
 
 def read_pair(
-    estimate_path: Path, truth_path: Path, sequence: SequenceSettings | None = None
+    estimate_path: Path, truth_path: Path, sequence: SequenceSettings | None = None, reference: str | None = None
 ) -> tuple[Trajectory, Trajectory, tuple[str, ...]]:
     """Both trajectories, and what was odd in their files. Two KITTI files of one length count the same frames.
+
+    Args:
+        estimate_path: a trajectory file, or the folder of a run.
+        truth_path: a trajectory file, or a sequence.
+        sequence: how the sequence is read.
+        reference: true poses that replace those of the sequence.
 
     Raises:
         InputError: a file that is no trajectory, a folder without one, a sequence without true poses.
     """
+    from improvo.evaluation.truth.reference import lacks_times
+    from improvo.evaluation.truth.referenced import open_with_truth
     from improvo.geometry.trajectory_files import read_trajectory_report
     from improvo.sequences import open_sequence
     from improvo.types import Trajectory
 
-    if truth_path.is_dir():
-        truth, truth_notes = open_sequence(truth_path, sequence).ground_truth, tuple[str, ...]()
+    if reference is not None:
+        truth = open_with_truth(truth_path, sequence or SequenceSettings(), reference).ground_truth
+        truth_notes: tuple[str, ...] = ()
+        assert truth is not None
+    elif lacks_times(truth_path):
+        raise InputError(f"{truth_path}: has no times; give the sequence as TRUTH, and this with --truth")
+    elif truth_path.is_dir():
+        truth, truth_notes = open_sequence(truth_path, sequence).ground_truth, ()
         if truth is None:
             raise InputError(f"{truth_path}: has no true poses; give a trajectory file or a sequence that has them")
     else:

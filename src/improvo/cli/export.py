@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from improvo.cli.output import say
+from improvo.cli.output import next_step, say
 from improvo.cli.show_options import add_recording, add_run_folder, target_path
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ def run_colmap(arguments: argparse.Namespace) -> None:
             f"{target}: {len(model.frames)} images, {len(model.xyz)} points, {len(model.error)} observations, "
             f"mean re-projection error {model.mean_error:.6f} px"
         )
+    next_step(f"open {arguments.output / 'sparse' / '0'} with COLMAP, pycolmap or what reads their model")
 
 
 def add_nerfstudio_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,6 +67,7 @@ def run_nerfstudio(arguments: argparse.Namespace) -> None:
     if len(segments) > 1:
         left = run_folder.frames - len(model.frames)
         say(f"  only the longest of {len(segments)} segments: {left} frames have no pose in its world")
+    next_step(f"`ns-train splatfacto --data {arguments.output}`, with Nerfstudio installed")
 
 
 def add_trajectory_arguments(parser: argparse.ArgumentParser) -> None:
@@ -84,6 +86,7 @@ def run_trajectory(arguments: argparse.Namespace) -> None:
     target = target_path(arguments.output, arguments.output, _FILE_NAMES[arguments.format])
     export_trajectory(run_folder.trajectory, run_folder.frames, target, arguments.format)
     say(f"{target}: {len(run_folder.trajectory)} poses, camera-to-world, in map units")
+    next_step(f"`improvo evaluate trajectory {target} TRUTH` measures them")
 
 
 def _add_model_arguments(parser: argparse.ArgumentParser, contents: str) -> None:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from improvo.cli.flags import add_setting
-from improvo.cli.output import say
+from improvo.cli.output import next_step, say
 from improvo.errors import OutputError
 from improvo.frontend.settings import NetworkSettings
 
@@ -35,3 +35,4 @@ def run(arguments: argparse.Namespace) -> None:
     export_onnx(load_weights(find_weights(arguments.weights)), arguments.output, settings)
     say(f"{arguments.output}: image (batch, 1, height, width) in [0, 1] -> {settings.max_keypoints} keypoints")
     say("without the move to the image's corners (`improvo.frontend.corners`), which `improvo run` makes afterwards")
+    next_step("load it with ONNX Runtime or any other runtime")

@@ -51,7 +51,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_setting(parser, defaults, "--max-keypoints", "frontend.max_keypoints")
     add_setting(parser, defaults, "--seed", "odometry.seed", help="of all random choices")
-    parser.add_argument("--json", action="store_true", help="print what was found as JSON")
     add_optimiser_arguments(parser.add_argument_group("training, in each round"), defaults, "training.optimiser")
     add_sequence_arguments(parser)
     add_config_arguments(parser)

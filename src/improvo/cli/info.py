@@ -15,7 +15,6 @@ from improvo.sequences.settings import InfoSettings
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `improvo info`."""
     parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a video, an image folder, a data set or a bag")
-    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
     add_setting(parser, InfoSettings(), "--samples", "samples", help="pairs of frames to look at")
     add_sequence_arguments(parser)
     add_config_arguments(parser)

@@ -40,13 +40,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_setting(
         parser,
         defaults,
-        "--max-stray",
+        "--flow-outlier-limit",
         "odometry.matching.flow_outlier_limit",
         metavar="SHARE",
         help="end tracks where a link is farther than this share of the image width from the frame's median motion; "
         "0.1 suits video of 10 frames a second and more (default: 0, never, as in the paper)",
     )
-    parser.add_argument("--json", action="store_true", help="print the records of all sequences as JSON")
     add_frontend_arguments(parser, defaults)
     add_sequence_arguments(parser)
     add_config_arguments(parser)

@@ -36,8 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         arguments = parser_for(words).parse_args(words)
-        output.configure(arguments.quiet, getattr(arguments, "json", False))
-        with termination_interrupts():
+        with output.configured(arguments.quiet, getattr(arguments, "json", False)), termination_interrupts():
             return int(arguments.run_command(arguments) or 0)
     except ImprovoError as error:
         print(f"improvo: {error}", file=sys.stderr)
@@ -82,6 +81,8 @@ def _add_commands(
             add_arguments, run = command.functions()
             add_arguments(parser)
             add_preset_argument(parser, command.settings.partition(":")[2])
+            if command.figures:
+                parser.add_argument("--json", action="store_true", help="print the figures as JSON, and nothing else")
             parser.add_argument("--quiet", action="store_true", help="print results and errors only")
             parser.set_defaults(run_command=run)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from improvo import terminal
@@ -12,17 +14,23 @@ _silent = False  # no lines for people
 _as_json = False
 
 
-def configure(quiet: bool = False, as_json: bool = False) -> None:
-    """Set by `main` for the command that follows."""
+@contextmanager
+def configured(quiet: bool, as_json: bool) -> Iterator[None]:
+    """For the command within; a command may run others."""
     global _silent, _as_json
+    before = _silent, _as_json
     _silent, _as_json = quiet or as_json, as_json
-    terminal.be_quiet(quiet)
+    try:
+        with terminal.quiet(quiet):
+            yield
+    finally:
+        _silent, _as_json = before
 
 
 def say(text: str) -> None:
     """A line about what was done; left out by --quiet and --json."""
     if not _silent:
-        terminal.line(text)
+        _line(text)
 
 
 def next_step(text: str) -> None:
@@ -39,11 +47,22 @@ def notice(text: str) -> None:
 def figures(data: Any, text: str) -> None:
     """The result of a command that ends in figures: a text for people, or JSON with --json; --quiet prints it too."""
     if _as_json:
-        print(json.dumps(data, indent=2))
+        print(json.dumps(data, indent=2, allow_nan=False))
     elif text:
-        terminal.line(text)
+        _line(text.rstrip("\n"))
 
 
 def as_json() -> bool:
     """Whether the command was given --json."""
     return _as_json
+
+
+def _line(text: str) -> None:
+    """Print past the progress bars, where there are any."""
+    if "tqdm" not in sys.modules:
+        print(text, flush=True)
+        return
+    from tqdm import tqdm
+
+    with tqdm.external_write_mode():
+        print(text, flush=True)

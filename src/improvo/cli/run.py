@@ -38,7 +38,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--report", action="store_true", help="write OUT/report.html at the end, as `improvo report` does"
     )
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     add_sequence_arguments(parser)
     add_config_arguments(parser)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
-from improvo.cli.output import say
+from improvo.cli.output import next_step, say
 from improvo.cli.show_options import (
     add_frames,
     add_palette,
@@ -56,6 +56,7 @@ def run_stability(arguments: argparse.Namespace) -> None:
         lambda frame: paint_stability(sequence[frame].image, frontend, f"frame {frame}, {shown_name}", colours),
         fps,
     )
+    next_step("open it")
 
 
 def add_matches_arguments(parser: argparse.ArgumentParser) -> None:
@@ -97,6 +98,7 @@ def run_matches(arguments: argparse.Namespace) -> None:
     target = target_path(arguments.output, Path(), "matches.png")
     write_png(target, np.concatenate(rows))
     say(str(target))
+    next_step("open it")
 
 
 def _add_recording(parser: argparse.ArgumentParser, default: str) -> None:

@@ -38,7 +38,6 @@ def add_training_arguments(parser: argparse.ArgumentParser, defaults: Any, paren
     add_optimiser_arguments(parser, defaults, "optimiser")
     add_setting(parser, defaults, "--seed", "optimiser.seed", help="of all random choices")
     add_setting(parser, defaults, "--workers", "optimiser.workers")
-    parser.add_argument("--json", action="store_true", help="print the last row of metrics as JSON")
     add_config_arguments(parser)
 
 

@@ -88,6 +88,7 @@ def run_calibrate(arguments: argparse.Namespace) -> None:
         names = ", ".join(str(path) for path in unreadable[:5])
         say(f"skipped {len(unreadable)} pictures that cannot be read: {names}")
     say(f"{output}: activation ranges over {len(paths) - len(unreadable)} pictures")
+    next_step(f"`improvo run SEQUENCE --frontend {output} -o out` runs them in int8")
 
 
 def run_show(arguments: argparse.Namespace) -> None:

@@ -62,9 +62,13 @@ class PoseError:
 
 
 def right_matches(geometry: PairGeometry, points_a: Float64, pixels_b: Float64, max_error: float) -> NDArray[np.bool_]:
-    """Whether matches (N,) are right: the point of A lands, by true pose and depth, closer than `max_error` px in B.
+    """Whether matches (N,) are right: the point of A lands, by true pose and depth, near its match in B.
 
-    Only matches whose keypoint in A has trusted depth can be judged; leave the others out before the call.
+    Args:
+        geometry: of the pair.
+        points_a: (N, 3) in the camera of A; matches without trusted depth are left out before the call.
+        pixels_b: (N, 2) where they were matched in B.
+        max_error: pixels; right is strictly below.
     """
     projected, _ = geometry.project_to_b(points_a)
     return np.asarray(np.linalg.norm(projected - pixels_b, axis=1) < max_error)
@@ -77,6 +81,12 @@ def repeated_keypoints(
 
     A keypoint of A counts as visible if it has trusted depth, lands inside B, and is not hidden there: where B has a
     depth map, the depth at that place must be known and agree within `hidden` (relative).
+
+    Args:
+        geometry: of the pair.
+        keypoints_a, keypoints_b: (N, 2) and (M, 2) pixels.
+        max_error: pixels; repeated is strictly below.
+        hidden: relative difference of depth beyond which a point is hidden.
 
     Returns:
         (visible, repeated)

@@ -32,19 +32,24 @@ class PoseSettings:
     curve_translation_m: float = 0.5
     resamples: int = 1000  # of the bootstrap
     confidence: float = 0.95  # of the intervals
+    shuffles: int = 1  # orders of a pair's matches that the solvers get; their mean is less noisy
+    right_px: tuple[float, float] = (3.0, 8.0)  # shares of right matches are given strictly below these distances
 
     def __post_init__(self) -> None:
         if not self.gaps or min(self.gaps) < 1 or len(set(self.gaps)) < len(self.gaps):
             raise ConfigError(f"gaps {list(self.gaps)}: give different numbers of frames, each 1 or more")
-        if self.pairs < 1 or self.max_keypoints < 4 or self.resamples < 1:
-            raise ConfigError("pairs and resamples must be at least 1, max_keypoints at least 4")
+        if min(self.pairs, self.resamples, self.shuffles) < 1 or self.max_keypoints < 4:
+            raise ConfigError("pairs, resamples and shuffles must be at least 1, max_keypoints at least 4")
         unknown = set(self.estimators) - set(ESTIMATORS)
         if unknown or not self.estimators:
             raise ConfigError(f"estimators {list(self.estimators)}: choose among {', '.join(ESTIMATORS)}")
         if self.depth_sampling not in SAMPLINGS:
             raise ConfigError(f"depth_sampling `{self.depth_sampling}` is unknown; choose among {', '.join(SAMPLINGS)}")
         limits = (self.max_rotation_deg, self.max_translation_m, self.max_error_px, self.depth_edge)
-        if min(*limits, self.curve_rotation_deg, self.curve_translation_m) <= 0 or not 0 < self.confidence < 1:
+        if (
+            min(*limits, *self.right_px, self.curve_rotation_deg, self.curve_translation_m) <= 0
+            or not 0 < self.confidence < 1
+        ):
             raise ConfigError("thresholds must be positive, and confidence between 0 and 1")
 
 

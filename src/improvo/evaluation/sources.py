@@ -37,21 +37,23 @@ class Recorded:
 
     path: str
     settings: SequenceSettings = field(default_factory=SequenceSettings)
+    truth: str | None = None  # file or folder of reference poses that replace the recording's own
 
     def open(self) -> Sequence:
         """The sequence, kept open between calls.
 
         Raises:
-            InputError: it cannot be opened.
+            InputError: it cannot be opened, or the reference poses do not fit it.
         """
-        return _open(self.path, self.settings)
+        return _open(self.path, self.settings, self.truth)
 
 
 @lru_cache(maxsize=4)
-def _open(path: str, settings: SequenceSettings) -> Sequence:
+def _open(path: str, settings: SequenceSettings, truth: str | None) -> Sequence:
+    from improvo.evaluation.truth.referenced import open_with_truth
     from improvo.sequences import open_sequence
 
-    return open_sequence(path, settings)
+    return open_sequence(path, settings) if truth is None else open_with_truth(path, settings, truth)
 
 
 class FeatureSource(Protocol):

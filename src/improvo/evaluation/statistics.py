@@ -1,4 +1,4 @@
-"""Accuracy over thresholds, the area under it, and bootstrap intervals."""
+"""Accuracy over thresholds, the areas under curves, and bootstrap intervals."""
 
 from __future__ import annotations
 
@@ -24,6 +24,27 @@ def area_shares(errors: Float64, limit: float) -> Float64:
     Their mean is the area, exactly: an error e is counted from e to the limit. 1 where no error is left.
     """
     return np.clip(1.0 - errors / limit, 0.0, None)
+
+
+def average_precision(scores: Float64, right: NDArray[np.bool_], possible: int | None = None) -> float | None:
+    """Precision averaged over the steps of recall; detections of equal score count as one step.
+
+    Args:
+        scores: (N,) of the detections, larger is accepted earlier.
+        right: (N,) whether a detection is right.
+        possible: number of right detections there could be; by default those of `right`.
+
+    Returns:
+        None where nothing could be right.
+    """
+    possible = int(right.sum()) if possible is None else possible
+    if possible == 0:
+        return None
+    order = np.argsort(-scores, kind="stable")
+    hits = np.cumsum(right[order])
+    last = np.flatnonzero(np.diff(scores[order], append=np.nan))  # of each step
+    precision = hits[last] / (last + 1)
+    return float((np.diff(hits[last] / possible, prepend=0.0) * precision).sum())
 
 
 class Bootstrap:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from improvo.errors import InputError, OutputError
+from improvo.errors import InputError
 from improvo.files import write_png
 from improvo.geometry import se3
 from improvo.odometry.run_folder import RunFolder
@@ -19,7 +19,7 @@ from improvo.types import Float64, Int64, UInt8
 class Model:
     """One segment; points and observations refer to `frames` by row."""
 
-    frames: Int64  # (F,) position in the processed sequence
+    frames: Int64  # (F,) frame_index of each
     cam_from_world: Float64  # (F, 4, 4)
     xyz: Float64  # (P, 3)
     stability: Int64  # (P,) label codes
@@ -97,9 +97,9 @@ def segments_by_length(run: RunFolder) -> list[int]:
     return [int(number) for number in numbers[np.argsort(-counts, kind="stable")]]
 
 
-def image_name(position: int) -> str:
+def image_name(frame: int) -> str:
     """The file name of a frame in an export."""
-    return f"frame_{position:06d}.png"
+    return f"frame_{frame:06d}.png"
 
 
 def write_images(run: RunFolder, model: Model, folder: Path, advance: Callable[[], None] = lambda: None) -> UInt8:
@@ -111,16 +111,12 @@ def write_images(run: RunFolder, model: Model, folder: Path, advance: Callable[[
         folder: made if need be.
         advance: is called after every frame.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from None
     grey = np.full(len(model.xyz), 128, np.uint8)
     first = np.flatnonzero(np.diff(model.point, prepend=-1))
     pixels = np.rint(model.keypoints[first]).astype(np.int64)
-    for row, position in enumerate(model.frames.tolist()):
-        image = run.image(position)
-        write_png(folder / image_name(position), image[..., None].repeat(3, axis=2))
+    for row, frame in enumerate(model.frames.tolist()):
+        image = run.image(frame)
+        write_png(folder / image_name(frame), image[..., None].repeat(3, axis=2))
         here = np.flatnonzero(model.frame[first] == row)
         v = np.clip(pixels[here, 1], 0, image.shape[0] - 1)
         u = np.clip(pixels[here, 0], 0, image.shape[1] - 1)

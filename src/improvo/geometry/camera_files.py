@@ -214,12 +214,26 @@ def _from_colmap(content: str, path: Path, camera: str | None) -> Calibration:
         raise InputError(f"{path}: has no COLMAP camera row (CAMERA_ID MODEL WIDTH HEIGHT PARAMS...); {_MEND}")
     _, model, width, height, *parameters = rows[0]
     try:
-        size, numbers = (int(width), int(height)), [float(value) for value in parameters]
-        intrinsics, distortion, name = _colmap_parameters(model, numbers)
+        return colmap_calibration(str(path), model, (int(width), int(height)), [float(value) for value in parameters])
     except ValueError as error:
         raise InputError(f"{path}: {error}; {_MEND}") from None
-    fx, fy, cx, cy = intrinsics
-    return _checked(Calibration(str(path), (fx, fy, cx - 0.5, cy - 0.5), distortion, name, size))
+
+
+def colmap_calibration(source: str, model: str, size: tuple[int, int], parameters: list[float]) -> Calibration:
+    """A camera of COLMAP as a calibration.
+
+    Args:
+        source: the file, for messages.
+        model: COLMAP's name of the camera model.
+        size: width and height of the images.
+        parameters: in COLMAP's order; its principal point counts from the corner of the top-left pixel.
+
+    Raises:
+        ValueError: an unknown model or another number of parameters.
+        InputError: numbers that cannot be.
+    """
+    (fx, fy, cx, cy), distortion, name = _colmap_parameters(model, parameters)
+    return _checked(Calibration(source, (fx, fy, cx - 0.5, cy - 0.5), distortion, name, size))
 
 
 def _colmap_parameters(model: str, p: list[float]) -> tuple[tuple[float, float, float, float], tuple[float, ...], str]:

@@ -1,7 +1,12 @@
-"""Small parts of compiled kernels that project a point; each becomes part of its callers."""
+"""Small parts of compiled kernels: the projection of a point, its residual, and Huber's loss of that.
+
+Each becomes part of its callers, in the solver and in the triangulation.
+"""
 # mypy: disable-error-code="no-untyped-def,no-untyped-call"
 
 from __future__ import annotations
+
+import math
 
 from improvo.compiled import inlined
 from improvo.geometry.camera import MIN_DEPTH
@@ -23,3 +28,18 @@ def inverse_depth(z):
     if abs(z) >= MIN_DEPTH:
         return 1.0 / z
     return -1.0 / MIN_DEPTH if z < 0.0 else 1.0 / MIN_DEPTH
+
+
+@inlined
+def residual(keypoint, x, y, scale, fx, fy, cx, cy):
+    """Projection minus keypoint, in pixels, of a point at (x, y) in the camera; `scale` is its inverse depth."""
+    return fx * (x * scale) + cx - keypoint[0], fy * (y * scale) + cy - keypoint[1]
+
+
+@inlined
+def huber(squared_norm, width):
+    """rho(s) and its slope rho'(s)."""
+    if squared_norm <= width * width:
+        return squared_norm, 1.0
+    norm = math.sqrt(squared_norm)
+    return 2.0 * width * norm - width * width, width / norm

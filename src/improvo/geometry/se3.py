@@ -34,12 +34,6 @@ def so3_exp(rotation_vector: Float64) -> Float64:
     return Rotation.from_rotvec(flat).as_matrix().reshape(*np.shape(rotation_vector)[:-1], 3, 3)
 
 
-def so3_log(rotation: Float64) -> Float64:
-    """(..., 3, 3) -> (..., 3) axis times angle in radians, angle in [0, pi]."""
-    flat = np.reshape(rotation, (-1, 3, 3))
-    return Rotation.from_matrix(flat).as_rotvec().reshape(*np.shape(rotation)[:-2], 3)
-
-
 def rotation_angle_deg(rotation: Float64) -> Float64:
     """Rotation angle in degrees, exact near zero and near 180 (no arccos)."""
     skew = rotation - np.swapaxes(rotation, -1, -2)

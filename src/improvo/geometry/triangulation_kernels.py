@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from improvo.compiled import compiled
-from improvo.geometry.projection_kernels import inverse_depth, point_in_camera
+from improvo.geometry.projection_kernels import huber, inverse_depth, point_in_camera, residual
 
 _SPREAD = 5  # views, evenly spaced over the track, whose pairs are two-view starts
 _PARALLAX_VIEWS = 48  # of a longer track, this many evenly spaced views decide its parallax
@@ -90,8 +90,7 @@ def _world_rays(keypoints, camera_index, views, cam_from_world, intrinsics, rays
 @compiled
 def _residual(keypoint, x, y, z, intrinsics):
     fx, fy, cx, cy = intrinsics
-    scale = inverse_depth(z)
-    return fx * (x * scale) + cx - keypoint[0], fy * (y * scale) + cy - keypoint[1]
+    return residual(keypoint, x, y, inverse_depth(z), fx, fy, cx, cy)
 
 
 @compiled
@@ -100,10 +99,7 @@ def _loss(squared_error, redescending, width):
     if redescending:
         shrink = 1.0 / (1.0 + squared_error / (width * width))
         return squared_error * shrink, shrink * shrink
-    if squared_error <= width * width:
-        return squared_error, 1.0
-    error = math.sqrt(squared_error)
-    return 2.0 * width * error - width * width, width / error
+    return huber(squared_error, width)
 
 
 @compiled

@@ -28,23 +28,22 @@ class MatchingSettings:
 
 @dataclass(frozen=True)
 class StartSettings:
-    """When two views are good enough to start a map (robust mode)."""
+    """When two views are good enough to start a map (mode `robust`)."""
 
-    min_common_tracks: int = 30  # of the earliest view that the newest still overlaps
-    min_matches: int = 60  # between the two, matched afresh
+    min_common_tracks: int = 30  # that the earliest view of a pair shares with the newest
+    min_matches: int = 60  # of the pair, matched afresh
     min_rotation_residual: float = 2.0  # pixels, median that the best pure rotation leaves of the matches
     max_buffered: int = 300  # frames in the initialisation buffer; the oldest leaves it without a pose
     epipolar_error: float = 1.0  # pixels, RANSAC threshold of the essential matrix and of the homography
-    max_homography_ratio: float = 0.7  # homography inliers / essential inliers; more is too little parallax
-    # points of the essential matrix that the homography leaves; so many show parallax whatever the ratio is
-    min_off_plane_points: int = 60
-    plane_ratio: float = 0.8  # from here on the scene is mostly a plane, and its homography is decomposed
-    min_parallax_deg: float = 1.0
-    min_points: int = 30  # over the minimum parallax
+    max_homography_ratio: float = 0.7  # homography inliers over essential inliers; more is too little parallax, unless
+    min_off_plane_points: int = 60  # so many essential inliers are no homography inliers, or
+    plane_ratio: float = 0.8  # the ratio is at least this: then the scene is one plane, and its homography is used
+    min_parallax_deg: float = 1.0  # of a point, for it to count
+    min_points: int = 30  # with that parallax
     min_inlier_share: float = 0.3  # essential inliers of the matches
     max_mean_error: float = 1.2  # pixels, after adjustment and pruning
     max_lost: int = 4  # buffered frames in a row, such as black ones, that may stay without a pose
-    max_cooldown: int = 30  # frames between two tries, doubled from 3 with each costly failure
+    max_cooldown: int = 30  # frames between two tries; it begins with 3 and doubles with each costly failure
 
 
 @dataclass(frozen=True)
@@ -60,6 +59,12 @@ class WindowSettings:
     max_error: float = 3.0  # pixels; observations over it are dropped, and the window is solved again
     paper_poses: int = 30  # N_last, of the mode `paper`
 
+    def __post_init__(self) -> None:
+        if min(self.recent, self.keyframes, self.fixed) < 1:
+            raise ConfigError("window: recent, keyframes and fixed must be at least 1")
+        if self.paper_poses < 2:
+            raise ConfigError(f"window.paper_poses={self.paper_poses}: must be at least 2")
+
 
 @dataclass(frozen=True)
 class TrackingLossSettings:
@@ -67,7 +72,7 @@ class TrackingLossSettings:
 
     min_inliers: int = 12
     min_inlier_share: float = 0.1
-    max_lost_frames: int = 10  # after this many frames without a pose the segment ends
+    max_lost_frames: int = 10  # more frames than this without a pose end the segment
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ class HealthSettings:
     epipolar_error: float = 1.5  # pixels
     min_inliers: int = 30  # of the two views' own essential matrix; fewer say nothing
     min_inlier_share: float = 0.15  # of their matches
-    rounds: int = 3  # consecutive checks that are judged together
+    rounds: int = 3  # consecutive checks that are evaluated together
     min_evidence: int = 100  # inliers in all of them; fewer decide nothing
     min_agreement: float = 0.85  # right maps stay over 0.90, wrong ones fall under 0.80
     provisional_frames: int = 60  # a map is provisional this long: contradicted, it starts anew over the same frames
@@ -87,10 +92,10 @@ class HealthSettings:
 
 @dataclass(frozen=True)
 class RansacGateSettings:
-    """Which keypoints a RANSAC may use, by their stability; a mover that fills its sample becomes the world."""
+    """Which keypoints a RANSAC may sample, by their stability (docs/odometry.md, "Stability")."""
 
     least_stability: float = 0.5  # of a keypoint, and of both ends of a match; 0 lets all in
-    enough: int = 50  # of them; where there are fewer, all are used, since a doubtful pose is better than none
+    enough: int = 50  # where fewer pass, all are used, since a doubtful pose is better than none
 
     def __post_init__(self) -> None:
         if not 0 <= self.least_stability <= 1:
@@ -102,7 +107,7 @@ class OdometrySettings:
     """Settings of `VisualOdometry`."""
 
     mode: str = "robust"  # `robust`, or `paper`: previous pose, unit depth, nothing else
-    seed: int = 0
+    seed: int = 0  # of every RANSAC
     matching: MatchingSettings = field(default_factory=MatchingSettings)
     start: StartSettings = field(default_factory=StartSettings)
     ransac_gate: RansacGateSettings = field(default_factory=RansacGateSettings)
@@ -117,3 +122,14 @@ class OdometrySettings:
     def __post_init__(self) -> None:
         if self.mode not in ("robust", "paper"):
             raise ConfigError(f"mode {self.mode!r}: choose `robust` or `paper`")
+
+
+# What the paper fixes ("Point Tracks", "Depth Regularization", "Final Bundle Adjustment Objective", "VO Backend
+# Implementation"), said in full so that no default can change it. It gives no Huber width and no tolerance.
+PAPER = OdometrySettings(
+    mode="paper",
+    matching=MatchingSettings(max_distance=0.7, flow_outlier_limit=0.0),
+    window=WindowSettings(paper_poses=30),
+    paper_objective=ObjectiveSettings(depth_min=0.1, depth_max=5.0, depth_weight=1.0),
+    paper_solver=SolverSettings(max_iterations=100, relative_decrease=1e-6),
+)

@@ -93,7 +93,13 @@ def _index(path: str) -> _Index:
 
 
 def candidate_names(sequence_name: str, frame: Frame, one_sequence: bool) -> list[str]:
-    """Names under which the features of a frame may be filed, most specific first."""
+    """Names under which the features of a frame may be filed, most specific first.
+
+    Args:
+        sequence_name: of the frame's sequence.
+        frame: of which features are wanted.
+        one_sequence: whether the run has a single sequence, so that a bare file name is enough.
+    """
     parts = [part for part in PurePath(frame.source).parts if part != "/"]
     tails = ["/".join(parts[-count:]) for count in range(min(len(parts), 6), 1, -1)]
     # A bare file name, or a tail without the sequence in it, may mean a frame of another sequence.

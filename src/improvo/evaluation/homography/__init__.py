@@ -1,0 +1,1 @@
+"""Repeatability and homography accuracy on image pairs, the tables of SuperPoint (DeTone et al. 2018)."""

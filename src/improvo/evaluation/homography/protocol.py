@@ -16,7 +16,8 @@ from improvo.evaluation.homography.pairs import Scene, open_scene
 from improvo.evaluation.measures import squared_distances
 from improvo.evaluation.settings import HomographySettings
 from improvo.evaluation.sources import LoadedFrontend
-from improvo.evaluation.statistics import Bootstrap
+from improvo.evaluation.statistics import Bootstrap, average_precision
+from improvo.evaluation.tables import bold_best, columns_to_rows, decimals, markdown
 from improvo.jobs.pool import Workers
 from improvo.tracking.matching import mutual_nearest_neighbours, unit_descriptors
 from improvo.training.views import inside, warp_points
@@ -76,7 +77,7 @@ def evaluate_pair(
     near = distance < settings.max_error_px
     a_shown, b_shown = a.take(shared_a), b.take(shared_b)
     similarity = unit_descriptors(a_shown) @ unit_descriptors(b_shown).T
-    precision = [average_precision(similarity, near), average_precision(similarity.T, near.T)]
+    precision = [matching_precision(similarity, near), matching_precision(similarity.T, near.T)]
     matches = mutual_nearest_neighbours(a_shown, b_shown)
     right = int(near[matches[:, 0], matches[:, 1]].sum())
     return {
@@ -91,7 +92,13 @@ def evaluate_pair(
 def correspondence(
     a: Features, b: Features, b_from_a: Float64, shape_a: tuple[int, ...], shape_b: tuple[int, ...]
 ) -> tuple[Int64, Int64, Float64]:
-    """Keypoints of each image that the other one shows, and their distances (N, M) in pixels of B."""
+    """Keypoints of each image that the other one shows, and their distances (N, M) in pixels of B.
+
+    Args:
+        a, b: features of the two images.
+        b_from_a: (3, 3) true homography.
+        shape_a, shape_b: (H, W) of the images.
+    """
     in_b = warp_points(b_from_a, a.keypoints.astype(np.float64))
     in_a = warp_points(np.asarray(np.linalg.inv(b_from_a), np.float64), b.keypoints.astype(np.float64))
     shared_a = np.flatnonzero(inside(in_b, shape_b[1], shape_b[0]))
@@ -100,28 +107,31 @@ def correspondence(
     return shared_a.astype(np.int64), shared_b.astype(np.int64), distance
 
 
-def average_precision(similarity: NDArray[np.floating], near: NDArray[np.bool_]) -> float:
-    """Area under precision over recall of nearest-neighbour matches, accepted from the most similar on.
+def matching_precision(similarity: NDArray[np.floating], near: NDArray[np.bool_]) -> float:
+    """Average precision of nearest-neighbour matches, accepted from the most similar on; 0 where none can be right.
 
     Args:
         similarity: (N, M) of descriptors.
         near: (N, M) whether two keypoints are the same point; recall counts the rows that have one.
     """
-    possible = int(near.any(axis=1).sum()) if near.size else 0
-    if possible == 0:
+    if near.size == 0:
         return 0.0
-    best = similarity.argmax(axis=1)
-    rows = np.arange(len(best))
-    order = np.argsort(-similarity[rows, best], kind="stable")
-    right = near[rows, best][order]
-    precision = np.cumsum(right) / np.arange(1, len(right) + 1)
-    return float(precision[right].sum()) / possible
+    best, rows = similarity.argmax(axis=1), np.arange(len(similarity))
+    possible = int(near.any(axis=1).sum())
+    return average_precision(similarity[rows, best].astype(np.float64), near[rows, best], possible) or 0.0
 
 
 def corner_error(
     a: Features, b: Features, b_from_a: Float64, shape_a: tuple[int, ...], settings: HomographySettings
 ) -> float:
-    """Mean distance of the image's corners under the estimated and the true homography; inf where none was found."""
+    """Mean distance of the image's corners under the estimated and the true homography; inf where none was found.
+
+    Args:
+        a, b: features of the two images.
+        b_from_a: (3, 3) true homography.
+        shape_a: (H, W) of image A.
+        settings: of the robust estimation.
+    """
     import cv2
 
     matches = mutual_nearest_neighbours(a, b)
@@ -188,3 +198,20 @@ def _summary(pairs: list[dict[str, Any]], settings: HomographySettings) -> dict[
     summary["localisation_error"] = float(np.mean(located)) if located else None
     summary["failures"] = int(np.isinf(corner).sum())
     return summary
+
+
+def homography_table(results: dict[str, Any]) -> str:
+    """`homography.json` as Markdown, one table per split."""
+    limits = [f"homography_{limit:g}px" for limit in results["settings"]["corner_errors_px"]]
+    parts = []
+    for split in dict.fromkeys(row["split"] for row in results["rows"]):
+        rows = [row for row in results["rows"] if row["split"] == split]
+        header = [f"{split}: {rows[0]['pairs']} pairs", "repeatab.", "localis. (px)", "mAP", "matching"]
+        header += [f"< {limit:g} px" for limit in results["settings"]["corner_errors_px"]]
+        columns = []
+        for field in ("repeatability", "localisation_error", "mean_average_precision", "matching_score", *limits):
+            values = [row[field] for row in rows]
+            cells = [decimals(value) for value in values]
+            columns.append(bold_best(cells, values, largest=field != "localisation_error"))
+        parts.append(markdown(header, columns_to_rows([row["frontend"] for row in rows], columns)))
+    return "\n\n".join(parts) + "\n"

@@ -85,6 +85,11 @@ def read_cache(folder: Path, fingerprint: dict[str, Any] | None = None) -> Featu
 def write_cache(folder: Path, fingerprint: dict[str, Any], features: dict[int, Features]) -> None:
     """Write a cache; `folder` appears complete or not at all, and replaces what was there.
 
+    Args:
+        folder: of one frontend and one sequence.
+        fingerprint: all that decides the features.
+        features: by frame.
+
     Raises:
         OutputError: it cannot be written.
     """

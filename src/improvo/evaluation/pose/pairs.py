@@ -56,6 +56,12 @@ def pairs_of_sequence(sequence: Sequence, gaps: tuple[int, ...], count: int, see
     They depend on the seed, the gap, and the sequence's name and length: not on the frontends, on the other gaps or
     on the other sequences of the run.
 
+    Args:
+        sequence: with true poses and depth.
+        gaps: frames between the two of a pair.
+        count: pairs per gap.
+        seed: of the choice.
+
     Raises:
         InputError: the sequence has no true poses, or no depth.
     """

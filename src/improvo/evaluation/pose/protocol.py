@@ -6,6 +6,7 @@ A's depth, solve for the camera of B, and compare with the true relative pose.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -27,7 +28,7 @@ from improvo.types import Features, Float64, Int64
 CHUNK = 25  # pairs of one task
 
 
-# One row per pair, frontend and estimator.
+# One row per pair, frontend, estimator and shuffle.
 RECORD = np.dtype(
     [
         ("sequence", np.int32),
@@ -36,10 +37,13 @@ RECORD = np.dtype(
         ("b", np.int32),
         ("frontend", np.int32),
         ("estimator", np.int32),
+        ("shuffle", np.int32),  # 0 is the order in which the matches came
         ("keypoints", np.int32),  # of A
         ("matches", np.int32),
         ("judged", np.int32),  # matches with trusted depth in A: those that the pose is estimated from
-        ("right", np.int32),  # judged matches that agree with the true pose
+        ("right", np.int32),  # judged matches that agree with the true pose, within max_error_px
+        ("right_strict", np.int32),  # the same within the first of right_px
+        ("right_loose", np.int32),  # and within the second
         ("visible", np.int32),  # keypoints of A that are visible in B
         ("repeated", np.int32),  # of which B has a keypoint at the same place
         ("inliers", np.int32),  # of the estimator, 0 where it failed
@@ -47,6 +51,7 @@ RECORD = np.dtype(
         ("translation_m", np.float64),
     ]
 )
+RIGHT = ("right", "right_strict", "right_loose")
 Records = NDArray[np.void]
 
 
@@ -66,7 +71,14 @@ class PairTask:
 def pair_tasks(
     sources: list[SequenceSource], sequences: list[SequencePairs], caches: list[list[Path]], settings: PoseSettings
 ) -> list[PairTask]:
-    """All pairs in chunks; `caches` is indexed by sequence, then frontend."""
+    """All pairs in chunks.
+
+    Args:
+        sources: of the sequences.
+        sequences: their pairs.
+        caches: folders of features, by sequence, then frontend.
+        settings: of the protocol.
+    """
     tasks = []
     for number, (source, sequence) in enumerate(zip(sources, sequences, strict=True)):
         for gap, pairs in sequence.pairs.items():
@@ -100,29 +112,60 @@ def evaluate_pairs(task: PairTask) -> Records:
 def evaluate_pair(
     geometry: PairGeometry, features_a: Features, features_b: Features, settings: PoseSettings
 ) -> Records:
-    """One record per estimator for one image pair and one frontend."""
-    rows = np.zeros(len(settings.estimators), RECORD)
+    """The records of one image pair and one frontend: estimator by estimator, shuffle by shuffle.
+
+    Args:
+        geometry: the truth about the pair.
+        features_a, features_b: of the two images.
+        settings: of the protocol.
+    """
+    rows = np.zeros(len(settings.estimators) * settings.shuffles, RECORD)
     matches = mutual_nearest_neighbours(features_a, features_b, max_distance=None)
     points = geometry.points_a(features_a.keypoints[matches[:, 0]])
     pixels = features_b.keypoints[matches[:, 1]].astype(np.float64)
     has_depth = np.isfinite(points[:, 2])
     points, pixels = points[has_depth], pixels[has_depth]
     rows["keypoints"], rows["matches"], rows["judged"] = len(features_a), len(matches), len(points)
-    rows["right"] = right_matches(geometry, points, pixels, settings.max_error_px).sum()
+    for name, limit in zip(RIGHT, (settings.max_error_px, *settings.right_px), strict=True):
+        rows[name] = right_matches(geometry, points, pixels, limit).sum()
     rows["visible"], rows["repeated"] = repeated_keypoints(
         geometry, features_a.keypoints, features_b.keypoints, settings.max_error_px
     )
-    for number, name in enumerate(settings.estimators):
-        error, inliers = solve(name, points, pixels, geometry.camera, geometry.b_from_a, settings.seed)
-        rows["estimator"][number], rows["inliers"][number] = number, inliers
-        rows["rotation_deg"][number], rows["translation_m"][number] = error.rotation_deg, error.translation_m
+    orders = shuffled_orders(len(points), settings.shuffles, settings.seed)
+    for row, (number, shuffle) in enumerate(itertools.product(range(len(settings.estimators)), range(len(orders)))):
+        order = orders[shuffle]
+        name = settings.estimators[number]
+        error, inliers = solve(name, points[order], pixels[order], geometry.camera, geometry.b_from_a, settings.seed)
+        rows["estimator"][row], rows["shuffle"][row], rows["inliers"][row] = number, shuffle, inliers
+        rows["rotation_deg"][row], rows["translation_m"][row] = error.rotation_deg, error.translation_m
     return rows
+
+
+def shuffled_orders(matches: int, shuffles: int, seed: int) -> list[Int64]:
+    """Orders in which the solvers get the matches: as they are, then random ones, the same for the same number.
+
+    Args:
+        matches: their number.
+        shuffles: orders wanted.
+        seed: of the random ones.
+    """
+    rng = np.random.default_rng([seed, matches])
+    return [np.arange(matches), *(rng.permutation(matches) for _ in range(shuffles - 1))]
 
 
 def solve(
     estimator: str, points_a: Float64, pixels_b: Float64, camera: Camera, b_from_a: Float64, seed: int
 ) -> tuple[PoseError, int]:
-    """Error of the pose from matches (N, 3) to (N, 2), and its inliers; a failure is an error of inf and 0 inliers."""
+    """Error of the pose from matches, and its inliers; a failure is an error of inf and 0 inliers.
+
+    Args:
+        estimator: name of the solver.
+        points_a: (N, 3) in the camera of A.
+        pixels_b: (N, 2) in B.
+        camera: of both.
+        b_from_a: (4, 4) true motion.
+        seed: of the solver.
+    """
     estimate = ESTIMATORS[estimator](points_a, pixels_b, camera, seed)
     if estimate is None:
         return PoseError.of_failure(), 0

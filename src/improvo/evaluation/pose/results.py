@@ -63,8 +63,9 @@ def results(run: PoseRun) -> dict[str, Any]:
 def _row(records: Records, settings: PoseSettings, bootstrap: Bootstrap) -> dict[str, Any]:
     """One cell of Table 1 with all that explains it; every mean is over pairs and has its interval."""
     rotation, translation = records["rotation_deg"], records["translation_m"]
-    row = {"pairs": len(records), **_means(_of_pairs(records, settings), bootstrap)}
-    row["failures"] = int(np.isinf(rotation).sum())  # pairs without any pose; they count as failures everywhere
+    row = {"pairs": len(records) // settings.shuffles, **_means(_of_pairs(records, settings), bootstrap)}
+    failures = int(np.isinf(rotation).sum())  # without any pose; they count as failures everywhere
+    row["failures"] = failures if settings.shuffles == 1 else failures / settings.shuffles
     row["median_rotation_deg"] = _finite(np.median(rotation))
     row["median_translation_m"] = _finite(np.median(translation))
     return row
@@ -73,7 +74,7 @@ def _row(records: Records, settings: PoseSettings, bootstrap: Bootstrap) -> dict
 def _difference(first: Records, second: Records, settings: PoseSettings, bootstrap: Bootstrap) -> dict[str, Any]:
     """Mean differences, second minus first, pair by pair: what is hard for both counts for neither."""
     before, after = _of_pairs(first, settings), _of_pairs(second, settings)
-    return _means({name: after[name].astype(np.float64) - before[name] for name in before}, bootstrap)
+    return _means({name: after[name] - before[name] for name in before}, bootstrap)
 
 
 def _means(values: dict[str, NDArray[Any]], bootstrap: Bootstrap) -> dict[str, Any]:
@@ -86,10 +87,11 @@ def _means(values: dict[str, NDArray[Any]], bootstrap: Bootstrap) -> dict[str, A
 
 
 def _of_pairs(records: Records, settings: PoseSettings) -> dict[str, NDArray[Any]]:
-    """What is averaged over pairs (N,), by name."""
+    """What is averaged over pairs (N,), by name; of a pair's shuffles the mean."""
     rotation, translation = records["rotation_deg"], records["translation_m"]
     turned, moved = below(rotation, settings.max_rotation_deg), below(translation, settings.max_translation_m)
-    return {
+    strict, loose = (f"right_share_{limit:g}px" for limit in settings.right_px)
+    values = {
         "rotation_success": turned,
         "translation_success": moved,
         "pose_success": turned & moved,
@@ -103,7 +105,10 @@ def _of_pairs(records: Records, settings: PoseSettings) -> dict[str, NDArray[Any
         "right_matches": records["right"],
         "inliers": records["inliers"],
         "inlier_share": share(records["inliers"], records["judged"]),
+        strict: share(records["right_strict"], records["judged"]),
+        loose: share(records["right_loose"], records["judged"]),
     }
+    return {name: of_records.reshape(-1, settings.shuffles).mean(axis=1) for name, of_records in values.items()}
 
 
 def share(part: Any, whole: Any) -> Float64:
@@ -150,7 +155,7 @@ def _sequence(run: PoseRun, number: int) -> dict[str, Any]:
 
 def _bootstrap(records: Records, settings: PoseSettings) -> Bootstrap:
     """Resamples of the pairs in `records`, the same for every frontend and solver."""
-    pairs = int(((records["frontend"] == 0) & (records["estimator"] == 0)).sum())
+    pairs = int(((records["frontend"] == 0) & (records["estimator"] == 0) & (records["shuffle"] == 0)).sum())
     return Bootstrap(pairs, settings.seed, settings.resamples, settings.confidence)
 
 
@@ -159,7 +164,7 @@ def _finite(value: float) -> float | None:
 
 
 def write_records(run: PoseRun, path: Any) -> None:
-    """`pairs.parquet`: one row per pair, frontend and estimator; a failed pose has infinite errors."""
+    """`pairs.parquet`: one row per pair, frontend, estimator and shuffle; a failed pose has infinite errors."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

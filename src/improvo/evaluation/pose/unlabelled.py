@@ -45,7 +45,13 @@ def usable_gaps(lengths: Sequence[int], settings: SurvivalSettings) -> tuple[int
 
 
 def spread_pairs(frames: int, gap: int, count: int) -> Int64:
-    """Up to `count` pairs (K, 2) of frames A and A + gap, evenly spread over `frames` frames."""
+    """Pairs (K, 2) of frames A and A + gap, evenly spread over a sequence.
+
+    Args:
+        frames: length of the sequence.
+        gap: frames between the two.
+        count: pairs wanted, at most.
+    """
     possible = max(frames - gap, 0)
     first = np.unique(np.linspace(0, possible - 1, min(count, possible)).round().astype(np.int64))
     return np.stack([first, first + gap], axis=1)
@@ -90,7 +96,13 @@ def surviving_matches(
 
 
 def agreeing_matches(a: Features, b: Features, camera: Camera, settings: SurvivalSettings) -> tuple[int, int]:
-    """The number of mutual nearest neighbours, and of those that agree with the epipolar geometry most agree with."""
+    """The number of mutual nearest neighbours, and of those that agree with the epipolar geometry most agree with.
+
+    Args:
+        a, b: features of the two images.
+        camera: of both.
+        settings: of the robust solver.
+    """
     from improvo.geometry.two_view import Ransac, relative_pose
 
     matches = mutual_nearest_neighbours(a, b, max_distance=None)

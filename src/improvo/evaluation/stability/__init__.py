@@ -1,0 +1,1 @@
+"""Instability against its true cause on simulated recordings; the paper shows it in pictures only."""

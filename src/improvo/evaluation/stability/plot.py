@@ -9,15 +9,15 @@ import numpy as np
 
 from improvo.evaluation.plots import COLOURS
 from improvo.evaluation.stability.causes import PRECEDENCE
-from improvo.evaluation.stability.protocol import HEADLINE, Judged
+from improvo.evaluation.stability.protocol import HEADLINE, ScoredPoints
 from improvo.files import written_atomically
 
 
-def draw_stability(judged: dict[str, Judged], results: dict[str, Any], path: Path) -> None:
+def draw_stability(scored: dict[str, ScoredPoints], results: dict[str, Any], path: Path) -> None:
     """Left: moving things and highlights against static points; right: recall and false alarms per true cause.
 
     Args:
-        judged: subject name -> its points.
+        scored: subject name -> its points.
         results: content of `stability.json`.
         path: PNG to write.
     """
@@ -28,7 +28,7 @@ def draw_stability(judged: dict[str, Judged], results: dict[str, Any], path: Pat
     FigureCanvasAgg(figure)
     curves, bars = figure.subplots(1, 2)
     number = 0
-    for name, points in judged.items():
+    for name, points in scored.items():
         static = points.cause == PRECEDENCE.index("static")
         positive = np.isin(points.cause, [PRECEDENCE.index(cause) for cause in HEADLINE])
         for score_name, score in points.scores.items():

@@ -25,14 +25,15 @@ from numpy.typing import NDArray
 from improvo.errors import InputError
 from improvo.evaluation.stability.causes import PRECEDENCE, TrueCauses, track_causes
 from improvo.evaluation.stability.true_errors import true_track_errors
+from improvo.evaluation.statistics import average_precision
 from improvo.types import Float32, Float64, Int64
 
 HEADLINE = ("moving", "highlight")
-STRAYED = 5.0  # pixels from where a static point would be, at which a track was wrongly linked, or its thing moved
+LEFT_PLACE_PX = 5.0  # distance from where a static point would be: wrongly linked, or the thing moved
 
 
 @dataclass(frozen=True)
-class Judged:
+class ScoredPoints:
     """Points with a true cause and something that says how unstable they are."""
 
     cause: NDArray[np.uint8]  # (N,) rank in PRECEDENCE
@@ -42,10 +43,10 @@ class Judged:
     true_error: Float64  # (N,) pixels, see `true_track_errors`; NaN where unknown
 
     @staticmethod
-    def joined(parts: Iterable[Judged]) -> Judged:
+    def joined(parts: Iterable[ScoredPoints]) -> ScoredPoints:
         """The points of several recordings together."""
         items = list(parts)
-        return Judged(
+        return ScoredPoints(
             np.concatenate([item.cause for item in items]),
             {name: np.concatenate([item.scores[name] for item in items]) for name in items[0].scores},
             np.concatenate([item.called_unstable for item in items]),
@@ -65,19 +66,7 @@ def roc_auc(score: Float64, positive: NDArray[np.bool_]) -> float | None:
     return float((ranks[positive].sum() - count * (count + 1) / 2) / (count * (len(positive) - count)))
 
 
-def average_precision(score: Float64, positive: NDArray[np.bool_]) -> float | None:
-    """Precision averaged over the recall steps; points of equal score count as one step. None without positives."""
-    if not positive.any():
-        return None
-    order = np.argsort(-score, kind="stable")
-    hits = np.cumsum(positive[order])
-    last = np.flatnonzero(np.diff(score[order], append=np.nan))
-    precision = hits[last] / (last + 1)
-    recall = hits[last] / positive.sum()
-    return float((np.diff(recall, prepend=0.0) * precision).sum())
-
-
-def judge_labels(labels: Path, simulation: Path) -> Judged:
+def score_labels(labels: Path, simulation: Path) -> ScoredPoints:
     """The labelled tracks of one run on one simulated recording.
 
     Args:
@@ -122,11 +111,20 @@ def judge_labels(labels: Path, simulation: Path) -> Judged:
             {row: image for row, image in depth.items() if image is not None},
         )
     total = np.bincount(cause, minlength=len(PRECEDENCE)).astype(np.int64)
-    return Judged(cause[labelled], scores, unstable, total, true_error)
+    return ScoredPoints(cause[labelled], scores, unstable, total, true_error)
 
 
 def median_errors(track: Int64, error: Float32, wanted: Int64) -> Float64:
-    """Median error (T,) of each wanted track, from rows of observations (M,); NaN rows do not count."""
+    """Median error (T,) of each wanted track.
+
+    Args:
+        track: (M,) of each observation.
+        error: (M,) pixels; NaN does not count.
+        wanted: (T,) tracks.
+
+    Raises:
+        InputError: a track without any error.
+    """
     from improvo.stability.grouping import medians, rows_of
 
     of_wanted = np.isin(track, wanted)
@@ -136,8 +134,14 @@ def median_errors(track: Int64, error: Float32, wanted: Int64) -> Float64:
     return result
 
 
-def judge_frontend(frontend: Any, simulation: Path, stride: int = 10, threshold: float = 0.5) -> Judged:
+def score_head(frontend: Any, simulation: Path, stride: int = 10, threshold: float = 0.5) -> ScoredPoints:
     """The keypoints of a frontend with a stability head, on every `stride`-th frame of a simulated recording.
+
+    Args:
+        frontend: with a stability head.
+        simulation: the recording.
+        stride: frames between those that are shown to it.
+        threshold: probability of being stable below which a keypoint is called unstable.
 
     Raises:
         InputError: the frontend has no stability head.
@@ -154,31 +158,31 @@ def judge_frontend(frontend: Any, simulation: Path, stride: int = 10, threshold:
         stability.append(features.stability.astype(np.float64))
     cause, stable = np.concatenate(causes), np.concatenate(stability)
     total = np.bincount(cause, minlength=len(PRECEDENCE)).astype(np.int64)
-    return Judged(cause, {"head": 1 - stable}, stable < threshold, total, np.full(len(cause), np.nan))
+    return ScoredPoints(cause, {"head": 1 - stable}, stable < threshold, total, np.full(len(cause), np.nan))
 
 
-def summarise(judged: Judged) -> dict[str, Any]:
+def summarise(scored: ScoredPoints) -> dict[str, Any]:
     """What `stability.json` says about these points."""
-    static = judged.cause == PRECEDENCE.index("static")
-    strayed = static & (judged.true_error >= STRAYED)
-    followed = static & (judged.true_error < STRAYED)
+    static = scored.cause == PRECEDENCE.index("static")
+    left_place = static & (scored.true_error >= LEFT_PLACE_PX)
+    followed = static & (scored.true_error < LEFT_PLACE_PX)
     groups = {"moving_or_highlight": HEADLINE, "all": PRECEDENCE[:-1], **{name: (name,) for name in PRECEDENCE[:-1]}}
     rows = []
     for group, names in groups.items():
         ranks = [PRECEDENCE.index(name) for name in names]
-        positive = np.isin(judged.cause, ranks)
-        rows.append(_row(group, int(judged.total[ranks].sum()), positive, static, followed, judged))
-    if np.isfinite(judged.true_error).any():
-        away = (judged.cause == PRECEDENCE.index("moving")) & (judged.true_error >= STRAYED)
-        rows.append(_row("moving_left_its_place", int(away.sum()), away, static, followed, judged))
-        rows.append(_row("wrong_links", int(strayed.sum()), strayed, followed, followed, judged))
+        positive = np.isin(scored.cause, ranks)
+        rows.append(_row(group, int(scored.total[ranks].sum()), positive, static, followed, scored))
+    if np.isfinite(scored.true_error).any():
+        away = (scored.cause == PRECEDENCE.index("moving")) & (scored.true_error >= LEFT_PLACE_PX)
+        rows.append(_row("moving_left_its_place", int(away.sum()), away, static, followed, scored))
+        rows.append(_row("wrong_links", int(left_place.sum()), left_place, followed, followed, scored))
     return {
         "causes": rows,
         "static": {
-            "points": int(judged.total[PRECEDENCE.index("static")]),
+            "points": int(scored.total[PRECEDENCE.index("static")]),
             "labelled": int(static.sum()),
-            **_share("false_alarms", static, judged),
-            "followed": {"labelled": int(followed.sum()), **_share("false_alarms", followed, judged)},
+            **_share("false_alarms", static, scored),
+            "followed": {"labelled": int(followed.sum()), **_share("false_alarms", followed, scored)},
         },
     }
 
@@ -189,22 +193,22 @@ def _row(
     positive: NDArray[np.bool_],
     static: NDArray[np.bool_],
     followed: NDArray[np.bool_],
-    judged: Judged,
+    scored: ScoredPoints,
 ) -> dict[str, Any]:
     """Counts, recall and measures of one group of positives."""
     measures = {}
-    for score_name, score in judged.scores.items():
+    for score_name, score in scored.scores.items():
         measures[score_name] = {
             "roc_auc": roc_auc(score[positive | static], positive[positive | static]),
             "roc_auc_followed": roc_auc(score[positive | followed], positive[positive | followed]),
             "average_precision": average_precision(score[positive | static], positive[positive | static]),
         }
     counts = {"cause": name, "points": points, "labelled": int(positive.sum())}
-    return {**counts, **_share("recall", positive, judged), "scores": measures}
+    return {**counts, **_share("recall", positive, scored), "scores": measures}
 
 
-def _share(name: str, chosen: NDArray[np.bool_], judged: Judged) -> dict[str, Any]:
-    unstable = judged.called_unstable[chosen]
+def _share(name: str, chosen: NDArray[np.bool_], scored: ScoredPoints) -> dict[str, Any]:
+    unstable = scored.called_unstable[chosen]
     return {"unstable": int(unstable.sum()), name: float(unstable.mean()) if len(unstable) else None}
 
 

@@ -76,7 +76,12 @@ def associate(first: Float64, second: Float64, max_difference: float) -> Int64:
 
 
 def align(truth: Float64, estimate: Float64, alignment: str) -> Similarity:
-    """The motion that carries estimated positions (N, 3) onto true ones: `sim3`, `se3` or `none` (identity).
+    """The motion that carries estimated camera centres onto true ones.
+
+    Args:
+        truth: (N, 3) true camera centres.
+        estimate: (N, 3) estimated ones.
+        alignment: `sim3`, `se3` or `none` (identity).
 
     Raises:
         InputError: fewer than three poses, or positions that leave the scale or rotation undefined.
@@ -138,25 +143,25 @@ def evaluate_trajectory(
     """
     settings = settings or TrajectorySettings()
     clean, unusable = clean_truth(truth)
-    pieces = aligned_segments(estimate, clean, settings, names)
-    segments = tuple(piece.summary() for piece in pieces)
-    aligned = [piece for piece in pieces if piece.motion is not None]
-    path = sum(segment.path_m for segment in segments if segment.ate_m is not None)
+    segments = aligned_segments(estimate, clean, settings, names)
+    summaries = tuple(segment.summary() for segment in segments)
+    aligned = [segment for segment in segments if segment.motion is not None]
+    path = sum(summary.path_m for summary in summaries if summary.ate_m is not None)
     ate = rotation = None
     if aligned:
-        distances, angles = zip(*(piece.errors() for piece in aligned), strict=True)
+        distances, angles = zip(*(segment.errors() for segment in aligned), strict=True)
         ate, rotation = Spread.of(np.concatenate(distances)), Spread.of(np.concatenate(angles))
     return TrajectoryErrors(
         alignment=settings.alignment,
         estimate_poses=int(estimate.valid.sum()),
         truth_poses=int(clean.valid.sum()),
-        poses=sum(len(piece.times) for piece in pieces),
+        poses=sum(len(segment.times) for segment in segments),
         invalid_truth=tuple(float(time) for time in truth.times[unusable]),
         path_m=path,
         ate_m=ate,
         ate_percent=100.0 * ate.rmse / path if ate and path > 0 else None,
         rotation_deg=rotation,
-        segments=segments,
+        segments=summaries,
         relative=errors_over_windows(aligned, settings),
     )
 
@@ -183,7 +188,7 @@ def aligned_segments(
     if len(pairs) == 0:
         raise InputError(_no_common_time(estimate, truth, settings.max_time_difference, names))
     estimate_rows, truth_rows = estimate_rows[pairs[:, 0]], truth_rows[pairs[:, 1]]
-    pieces = []
+    segments = []
     for segment in np.unique(estimate.segment[estimate_rows]):
         chosen = estimate.segment[estimate_rows] == segment
         true_poses = truth.world_from_cam[truth_rows[chosen]]
@@ -194,16 +199,16 @@ def aligned_segments(
         except InputError as error:
             note = str(error)
         times = truth.times[truth_rows[chosen]]
-        pieces.append(AlignedSegment(int(segment), times, true_poses, poses, motion, note))
-    return pieces
+        segments.append(AlignedSegment(int(segment), times, true_poses, poses, motion, note))
+    return segments
 
 
-def errors_over_windows(pieces: list[AlignedSegment], settings: TrajectorySettings) -> tuple[RelativeErrors, ...]:
+def errors_over_windows(aligned: list[AlignedSegment], settings: TrajectorySettings) -> tuple[RelativeErrors, ...]:
     """Relative errors over all windows of aligned segments: by time, by distance, by share of their whole path."""
     windows = [(length, "s") for length in settings.time_windows]
     windows += [(length, "m") for length in settings.distance_windows]
     windows += [(length, "path") for length in settings.path_fractions]
-    segments = [(p.times, p.truth, p.estimate, p.motion.scale) for p in pieces if p.motion is not None]
+    segments = [(s.times, s.truth, s.estimate, s.motion.scale) for s in aligned if s.motion is not None]
     return tuple(relative_errors(length, unit, segments, settings.window_tolerance) for length, unit in windows)
 
 

@@ -43,7 +43,7 @@ class VoOutcome:
     variant: str  # WITH, WITHOUT, or "" for a frontend without a stability head
     frames: int  # that were processed
     trajectory: Trajectory
-    pieces: list[AlignedSegment]  # empty where odometry found no pose
+    segments: list[AlignedSegment]  # empty where odometry found no pose
     errors: dict[str, Any] | None  # of this sequence alone; None where odometry found no pose
     note: str
 
@@ -83,15 +83,15 @@ def _track(odometry: VisualOdometry, detected: list[tuple[float, Features]]) -> 
 def _outcome(sequence: Sequence, task: VoTask, variant: str, frames: int, trajectory: Trajectory) -> VoOutcome:
     truth = sequence.ground_truth
     assert truth is not None  # `usable` has looked
-    pieces: list[AlignedSegment] = []
+    segments: list[AlignedSegment] = []
     errors, note = None, ""
     try:
-        pieces = aligned_segments(trajectory, clean_truth(truth)[0], task.trajectory)
+        segments = aligned_segments(trajectory, clean_truth(truth)[0], task.trajectory)
         errors = to_dict(evaluate(trajectory, truth, task.trajectory))
     except InputError as error:
         note = str(error) if len(trajectory) else "odometry found no pose"
     label = task.frontend.rpartition("/")[2].removesuffix(".safetensors")
-    return VoOutcome(sequence.name, label, variant, frames, trajectory, pieces, errors, note)
+    return VoOutcome(sequence.name, label, variant, frames, trajectory, segments, errors, note)
 
 
 def usable(sources: list[Recorded]) -> tuple[list[Recorded], list[ExcludedSequence]]:
@@ -149,7 +149,7 @@ def evaluate_vo(
     rows = []
     for frontend, variant in dict.fromkeys((o.frontend, o.variant) for o in outcomes):
         own = [o for o in outcomes if (o.frontend, o.variant) == (frontend, variant)]
-        relative = errors_over_windows([piece for o in own for piece in _aligned(o)], pooled)
+        relative = errors_over_windows([segment for o in own for segment in _aligned(o)], pooled)
         percents = [o.errors["ate_percent"] for o in own if o.errors and o.errors["ate_percent"] is not None]
         rows.append(
             {
@@ -158,7 +158,7 @@ def evaluate_vo(
                 "sequences": len(own),
                 "frames": sum(o.frames for o in own),
                 "tracked": sum(int(o.trajectory.valid.sum()) for o in own),
-                "segments": sum(len(o.pieces) for o in own),
+                "segments": sum(len(o.segments) for o in own),
                 "mean_ate_percent": float(np.mean(percents)) if percents else None,
                 "relative": [to_dict(entry) for entry in relative],
             }
@@ -182,4 +182,4 @@ def evaluate_vo(
 
 
 def _aligned(outcome: VoOutcome) -> list[AlignedSegment]:
-    return [piece for piece in outcome.pieces if piece.motion is not None]
+    return [segment for segment in outcome.segments if segment.motion is not None]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from improvo.evaluation.statistics import average_precision
 from improvo.training.photometric import augment
 from improvo.training.settings import PhotometricSettings
 from improvo.training.shapes import FAMILIES, draw_shape
@@ -72,13 +73,7 @@ def _average_precision(found: Sequence[tuple[ShapeTest, Float32, Float32]], pixe
                 free[nearest] = False
             right.append(hit)
         scores.extend(confidence[order])
-    if not right:
-        return 0.0
-    hits = np.array(right)[np.argsort(-np.array(scores), kind="stable")]
-    recall = np.cumsum(hits) / corners
-    precision = np.cumsum(hits) / np.arange(1, len(hits) + 1)
-    precision = np.maximum.accumulate(precision[::-1])[::-1]
-    return float(np.sum(np.diff(recall, prepend=0.0) * precision))
+    return average_precision(np.array(scores, np.float64), np.array(right, np.bool_), corners) or 0.0
 
 
 def classical_detectors(keypoints: int = 100) -> Mapping[str, ScoredDetector]:

@@ -1,0 +1,83 @@
+"""Reference poses and the camera of a recording by structure from motion, to measure odometry and frontends against.
+
+The scale comes from the recording's depth images, or from `--scale-from`. A bad result is not written. What the work
+has reached so far lies beside FILE, and an interrupted call goes on from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from improvo import terminal
+from improvo.cli.evaluate_options import available_cores
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.output import figures, next_step
+from improvo.evaluation.truth.settings import CALIBRATE, TruthCommandSettings, TruthSettings
+
+_FLAGS = {"calibrate": "truth.calibrate", "max_features": "truth.max_features", "seed": "truth.seed"}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `improvo truth`."""
+    defaults, absent = TruthSettings(), argparse.SUPPRESS
+    parser.add_argument("sequence", type=Path, metavar="SEQUENCE")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", required=True, help="poses and camera")
+    parser.add_argument("--scale-from", metavar="POSES", help="poses in metres, where the recording has no depth")
+    parser.add_argument("--model", type=Path, metavar="DIR", help="a COLMAP model, instead of making one")
+    parser.add_argument(
+        "--calibrate",
+        choices=CALIBRATE,
+        default=absent,
+        help="how much of the camera is found from the images; `full` needs a camera that turns in several directions "
+        f"(default: {defaults.calibrate})",
+    )
+    parser.add_argument(
+        "--max-features",
+        type=int,
+        default=absent,
+        metavar="N",
+        help=f"SIFT features per image (default: {defaults.max_features})",
+    )
+    parser.add_argument("--seed", type=int, default=absent, help=f"of all random choices (default: {defaults.seed})")
+    parser.add_argument("--workers", type=int, default=available_cores(), metavar="N", help="threads of COLMAP")
+    add_sequence_arguments(parser)
+    add_config_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write FILE and its quality as JSON beside it; print the quality."""
+    from contextlib import ExitStack
+
+    from improvo.evaluation.truth.make import make_truth
+    from improvo.evaluation.truth.structure_from_motion import load_pycolmap
+    from improvo.sequences import open_sequence
+
+    settings = settings_from(TruthCommandSettings, arguments, _FLAGS)
+    load_pycolmap()  # said before any work
+    sequence = open_sequence(arguments.sequence, settings.sequence)
+    before: dict[str, int] = {}  # stage -> how many were done when it was last heard of
+    bar = terminal.Progress()
+
+    def told(stage: str, done: int, total: int) -> None:
+        nonlocal bar
+        if stage not in before:
+            stages.close()
+            bar = stages.enter_context(terminal.progress(stage, "step", total))
+        bar.advance(done - before.get(stage, 0))
+        before[stage] = done
+
+    with ExitStack() as stages:
+        quality = make_truth(
+            sequence,
+            arguments.output,
+            settings.truth,
+            scale_from=arguments.scale_from,
+            model=arguments.model,
+            threads=arguments.workers,
+            progress=told,
+        )
+    figures(asdict(quality), f"{arguments.output}: {quality.text()}")
+    next_step(f"`improvo evaluate trajectory OUT {arguments.sequence} --truth {arguments.output}`")
+    return 0

@@ -1,0 +1,82 @@
+"""The look-ahead: frames in order, computed by one other thread, errors when their turn comes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from improvo.odometry.ahead import detected_ahead
+from improvo.odometry.visual_odometry import MatchedFeatures
+from improvo.types import Features, Frame, UInt8
+
+
+def frames(count: int, read: list[int] | None = None, fails_at: int | None = None) -> Iterator[Frame]:
+    for i in range(count):
+        if i == fails_at:
+            raise ValueError(f"frame {i} is damaged")
+        if read is not None:
+            read.append(i)
+        yield Frame(i, i / 30.0, np.full((2, 2), i, np.uint8), f"{i}.png")
+
+
+def detect(image: UInt8) -> Features:
+    return Features(np.full((1, 2), image[0, 0], np.float32), np.zeros((1, 4), np.float32), np.ones(1, np.float32))
+
+
+def match(features: Features) -> MatchedFeatures:
+    return MatchedFeatures(features, np.zeros((1, 4), np.float32), None)
+
+
+def test_frames_come_in_order_each_with_its_own_features() -> None:
+    seen = list(detected_ahead(frames(20), detect, match))
+    assert [each.frame.source_index for each in seen] == list(range(20))
+    assert [each.matched.features.keypoints[0, 0] for each in seen] == list(range(20))
+    assert all(min(each.reading, each.detecting, each.matching) >= 0.0 for each in seen)
+
+
+def test_no_frames_at_all() -> None:
+    assert list(detected_ahead([], detect, match)) == []
+
+
+def test_all_work_is_done_in_one_other_thread() -> None:
+    threads = set()
+
+    def noted(features: Features) -> MatchedFeatures:
+        threads.add(threading.get_ident())
+        return match(features)
+
+    list(detected_ahead(frames(10), detect, noted))
+    assert len(threads) == 1
+    assert threading.get_ident() not in threads
+
+
+def test_it_reads_no_more_than_a_few_frames_ahead() -> None:
+    read: list[int] = []
+    ahead = detected_ahead(frames(100, read), detect, match)
+    next(ahead)
+    time.sleep(0.1)
+    assert len(read) <= 4
+    ahead.close()
+
+
+@pytest.mark.parametrize("fails_at", [0, 1, 5])
+def test_an_error_comes_after_everything_before_it(fails_at: int) -> None:
+    ahead = detected_ahead(frames(10, fails_at=fails_at), detect, match)
+    assert [next(ahead).frame.source_index for _ in range(fails_at)] == list(range(fails_at))
+    with pytest.raises(ValueError, match=f"frame {fails_at} is damaged"):
+        next(ahead)
+
+
+def test_leaving_early_leaves_no_thread() -> None:
+    before = threading.active_count()
+    for each in detected_ahead(frames(100), detect, match):
+        if each.frame.source_index == 3:
+            break
+    deadline = time.monotonic() + 5.0
+    while threading.active_count() > before and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert threading.active_count() == before
