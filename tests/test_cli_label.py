@@ -68,7 +68,7 @@ def test_the_store_reads_back(labelled: Path, walks: list[Path]) -> None:
     kitchen = sequences[1]
     assert (kitchen.points.stability == STABLE).sum() == kitchen.record.stable
     assert set(kitchen.tracks.track) == set(kitchen.points.track)
-    assert kitchen.frames.index.tolist() == list(range(22))
+    assert kitchen.frames.source_index.tolist() == list(range(22))
     picture = cv2.imread(str(walks[0] / "000007.png"), cv2.IMREAD_GRAYSCALE)
     np.testing.assert_array_equal(kitchen.image(7), picture)
 

@@ -72,11 +72,11 @@ def test_training_never_sees_what_is_held_back(finished: tuple[Improvement, Fake
     for call in training.calls:
         (store,) = call["labels"]
         (labelled,) = read_labels(store)
-        assert labelled.frames.index.tolist() == list(range(28))
+        assert labelled.frames.source_index.tolist() == list(range(28))
         assert labelled.settings.end == 28
     for candidate in result.candidates[:2]:  # the last is too bad to track anything
         (judged,) = read_labels(candidate.held_back)
-        assert judged.frames.index.tolist() == list(range(28, 40))
+        assert judged.frames.source_index.tolist() == list(range(28, 40))
 
 
 def test_the_best_weights_are_kept_and_the_report_is_there(
@@ -189,7 +189,7 @@ def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(wa
     (store,) = training.calls[0]["labels"]
     (labelled,) = read_labels(store)
     assert labelled.name == "room"
-    assert 4 not in labelled.frames.index  # unreadable
+    assert 4 not in labelled.frames.source_index  # unreadable
     assert [found.name for found in read_labels(result.candidates[0].held_back)] == ["hall"]
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Left out: black: " in page

@@ -99,7 +99,7 @@ def test_names_are_unique_and_the_same_each_time(tmp_path):
 def test_frames_round_trip(tmp_path):
     frames = FramesTable(
         frame=np.arange(4),
-        index=np.arange(4) * 3,
+        source_index=np.arange(4) * 3,
         time=np.arange(4) / 7,
         segment=np.array([-1, 0, 0, 1]),
         trusted=np.array([False, True, True, False]),

@@ -52,6 +52,12 @@ def to_yaml(settings: Any) -> str:
 def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = (), base: T | None = None) -> T:
     """Settings of type `cls` from defaults (or `base`, such as a preset), a YAML file and `a.b=value` overrides.
 
+    Args:
+        cls: a frozen dataclass of settings.
+        path: YAML file with some or all of them.
+        overrides: `section.name=value` each; they win over the file.
+        base: what counts where neither says anything; the defaults if None.
+
     Raises:
         ConfigError: a file that is no YAML mapping, an unknown key, or a value of the wrong type.
     """
@@ -90,6 +96,12 @@ def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = (), 
 
 def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings", base: T | None = None) -> T:
     """Build the dataclass `cls` from nested dictionaries; what they leave out is as in `base`, or as in the defaults.
+
+    Args:
+        cls: a frozen dataclass of settings.
+        values: some or all of them, under present or former names.
+        where: what to call the source in a message.
+        base: what counts where `values` says nothing; the defaults if None.
 
     Raises:
         ConfigError: an unknown key (with the nearest known one) or a value of the wrong type.

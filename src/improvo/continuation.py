@@ -97,7 +97,13 @@ class SettingsRecord:
 
 
 def first_difference(before: Any, now: Any, prefix: str = "") -> str:
-    """The first setting that differs between two nested dictionaries, in words; empty where none does."""
+    """The first setting that differs between two nested dictionaries, in words; empty where none does.
+
+    Args:
+        before: nested dictionaries, or a value.
+        now: the same, later.
+        prefix: of the names of settings, with a dot at its end.
+    """
     if not (isinstance(before, dict) and isinstance(now, dict)):
         return "" if before == now else f"{prefix.rstrip('.')}={_short(before)}, now {_short(now)}"
     for key in [*before, *(key for key in now if key not in before)]:

@@ -232,7 +232,13 @@ def starting_weights(name: str) -> Path:
 
 
 def write_calibrated(source: Path, target: Path, images: Sequence[UInt8]) -> None:
-    """Copy weights with activation ranges over the images, so that they run in int8 where that can run them at all."""
+    """Copy weights with activation ranges over the images, so that they run in int8 where that can run them at all.
+
+    Args:
+        source: weights file.
+        target: weights file to write.
+        images: grey images (H, W).
+    """
     from improvo.frontend.quantisation import calibrate
 
     weights = load_weights(source)

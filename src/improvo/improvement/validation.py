@@ -74,13 +74,28 @@ def rule(settings: ValidationSettings) -> str:
 
 
 def is_better(candidate: Validation, best: Validation, settings: ValidationSettings) -> bool:
-    """Whether a frontend is better than the best one before it; `rule` says it in words."""
+    """Whether a frontend is better than the best one before it; `rule` says it in words.
+
+    Args:
+        candidate: what was measured of it.
+        best: what was measured of the best one, on the same frames and pairs.
+        settings: how many frames it may lose.
+    """
     kept = candidate.tracked >= (1 - settings.frames_lost) * best.tracked
     return kept and gain_interval(candidate, best)[0] > 0
 
 
 def gain_interval(candidate: Validation, before: Validation, seed: int = 0) -> tuple[float, float]:
-    """95 % interval of the gain in score, over paired resamples of the pairs, gap by gap."""
+    """95 % interval of the gain in score, over paired resamples of the pairs, gap by gap.
+
+    Args:
+        candidate: what was measured of a frontend.
+        before: what was measured of another one, on the same pairs.
+        seed: of the resamples.
+
+    Returns:
+        Lower and upper bound, in surviving matches.
+    """
     gain = spread = 0.0
     for gap in before.gaps:
         gains = np.array(candidate.agreeing[str(gap)]) - np.array(before.agreeing[str(gap)])

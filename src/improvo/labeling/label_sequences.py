@@ -48,8 +48,12 @@ def label_sequences(
     """Label every recording that the store does not have yet.
 
     Args:
+        paths: of the recordings.
         folder: of the label store, see `improvo.labeling.store`.
+        settings: of the odometry and the labels.
         workers: sequences at a time, a process for each; one, or with `ray` as many as the cluster has cores, if None.
+        pack: whether to keep the frames beside the labels.
+        relabel: where the store was made with other settings, clear it instead of refusing.
         ray: address of a Ray cluster that does the work, see `improvo.jobs.on_ray`.
         on_record: is told each sequence as it is done, has failed, or was done before.
         on_frames: is told the number of further frames processed.
@@ -116,7 +120,7 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
         raise InputError(f"{job.path}: no track has a label ({_why_none(quality.counts(), counts)})")
     frames = FramesTable(
         frame=np.arange(len(trajectory)),
-        index=np.array(report["frames"]["source_index"], np.int64),
+        source_index=np.array(report["frames"]["source_index"], np.int64),
         time=trajectory.times,
         segment=trajectory.segment,
         trusted=quality.trusted,

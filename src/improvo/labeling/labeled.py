@@ -76,7 +76,7 @@ class LabeledSequence:
         return poses
 
     def image(self, frame: int) -> UInt8:
-        """The grey image (H, W) at a position of the processed sequence, packed or from the recording.
+        """The grey image (H, W) of a frame of the processed sequence, packed or from the recording.
 
         Raises:
             InputError: neither is there.
@@ -90,7 +90,7 @@ class LabeledSequence:
         from improvo.sequences import open_sequence
 
         sequence = open_sequence(self.record.path, self.settings)
-        rows = np.searchsorted(sequence.indices, self.frames.index)
+        rows = np.searchsorted(sequence.indices, self.frames.source_index)
         return lambda frame: sequence[int(rows[frame])].image
 
 

@@ -5,7 +5,7 @@
         settings.yaml           what the labels were made with; other settings are refused
         NAME/                   appears, complete, when the sequence is done
             tracks.parquet, points.parquet, trajectory.txt, map.ply, run.json
-            frames.parquet      position, index in the recording, time, segment, trusted
+            frames.parquet      frame, index in the recording, time, segment, trusted
             images-00000.parquet ...   with --pack: the frames themselves
             label.json          this sequence's row of the manifest
 

@@ -46,7 +46,17 @@ class TrackLabels:
 
 
 def classify(observations: Int64, mean_error: Float64, max_error: Float64, settings: LabelSettings) -> NDArray[np.int8]:
-    """The rule alone (paper, eq. stability): codes (T,)."""
+    """The rule alone (paper, eq. stability).
+
+    Args:
+        observations: (T,) number of observations T_j of each track.
+        mean_error: (T,) pixels; NaN for a track without a point.
+        max_error: (T,) pixels.
+        settings: the three thresholds.
+
+    Returns:
+        (T,) STABLE, UNSTABLE or IGNORE.
+    """
     long_enough = observations >= settings.min_observations
     stable = long_enough & (mean_error <= settings.stable_mean_error)
     unstable = long_enough & ~stable & (max_error >= settings.unstable_max_error)
@@ -69,6 +79,7 @@ def label_stability(
         cam_from_world: (F, 4, 4) final poses by `tracks.frame`; NaN where there is none.
         segment: (F,) segment of each pose, -1 where there is none; a track is judged in the one that saw most of it.
         K: (3, 3).
+        settings: the rule, and how a track's point is found.
         point: (T,) map point of each track in the order in which the tracks appear, -1 where none; for the record.
         point_xyz: (T, 3) where the odometry already has the point, NaN where it is to be solved here.
 

@@ -59,7 +59,7 @@ def tracks_schema() -> pa.Schema:
 
     return pa.schema(
         [
-            ("frame", pa.int32()),  # position in the processed sequence
+            ("frame", pa.int32()),  # index in the processed sequence
             ("track", pa.int64()),
             ("u", pa.float32()),  # pixels of the processed frames
             ("v", pa.float32()),
@@ -158,7 +158,7 @@ class TracksWriter(_TableWriter):
         """Append whole tracks, one row per observation, sorted by track, then frame.
 
         Args:
-            frame: (M,) position in the processed sequence.
+            frame: (M,) index in the processed sequence.
             track: (M,) track id; no other call has rows of these tracks.
             keypoints: (M, 2) pixels.
             weight: (M,) observation confidence w_ij.
