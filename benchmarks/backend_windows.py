@@ -62,7 +62,7 @@ def simulated_recording(frames: int, tracks: int, seed: int, outliers: float) ->
 def real_recording(folder: Path, start: int, frames: int) -> Recording:
     """SIFT tracks of consecutive frames, connect-the-dots, under the ground-truth poses."""
     sequence = open_sequence(folder)
-    frontend, chain = load_frontend("sift", max_keypoints=2000), TrackChain()
+    frontend, chain = load_frontend("sift", max_keypoints=2000, opencv_defaults=True), TrackChain()
     features, ids = [], []
     for i in range(start, start + frames):
         features.append(frontend(sequence[i].image))

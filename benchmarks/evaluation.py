@@ -25,7 +25,8 @@ from improvo.evaluation.pose.results import results
 from improvo.evaluation.pose.run import PoseRun
 from improvo.evaluation.settings import PoseSettings
 from improvo.evaluation.sources import LoadedFrontend, Recorded
-from improvo.jobs.pool import Workers, available_cores
+from improvo.jobs.pool import Workers
+from improvo.jobs.workers import available_cores
 from improvo.types import Features
 
 

@@ -55,7 +55,9 @@ def main() -> None:
     parser.add_argument("--gap", type=int, default=5, help="frames between the two")
     parser.add_argument("--pairs", type=int, default=12, help="of each sequence")
     arguments = parser.parse_args()
-    frontends: dict[str, Frontend] = {name: load_frontend(name, KEYPOINTS) for name in ("sift", "orb", "akaze")}
+    frontends: dict[str, Frontend] = {
+        name: load_frontend(name, KEYPOINTS, opencv_defaults=True) for name in ("sift", "orb", "akaze")
+    }
     for name in arguments.frontend:
         for radius in RADII:
             frontends[f"{name}, corner radius {radius}"] = load_network_frontend(

@@ -22,7 +22,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 from rendered_walk import write_walk  # of the tests: run with PYTHONPATH=tests
 
-from improvo.labeling.labelled import read_labels
+from improvo.labeling.labeled import read_labels
 from improvo.labeling.store import read_records
 
 OPTIONS = ["--frontend", "orb", "--max-keypoints", "300", "--set", "labels.min_observations=6", "--pack"]

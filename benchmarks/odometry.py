@@ -27,7 +27,7 @@ import numpy as np
 from improvo.backend.compile import compile_kernels
 from improvo.evaluation.settings import TrajectorySettings
 from improvo.evaluation.trajectory.protocol import evaluate_trajectory
-from improvo.frontend.registry import load_odometry_frontend
+from improvo.frontend.registry import load_frontend
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.sequences import open_sequence
@@ -79,7 +79,7 @@ def main() -> None:
 def runs(folder: Path, frontend_name: str, modes: list[str], seeds: int, max_keypoints: int) -> Iterator[Row]:
     """All modes and seeds of one sequence and frontend; the features are computed once."""
     sequence = open_sequence(folder)
-    frontend = load_odometry_frontend(frontend_name, max_keypoints)
+    frontend = load_frontend(frontend_name, max_keypoints)
     start = time.perf_counter()
     detected = [(frame.time, frontend(frame.image)) for frame in sequence]
     frontend_ms = 1e3 * (time.perf_counter() - start) / len(detected)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import json
@@ -40,28 +39,16 @@ def _pages(nav: Any) -> list[str]:
 
 
 def _help_texts() -> list[str]:
-    from improvo.cli.main import COMMANDS, main
+    from improvo.cli.commands import leaves
+    from improvo.cli.main import main
 
     lines = []
-    for verb in COMMANDS:
-        for words in ([verb], *([verb, sub] for sub in _subcommands(verb))):
-            text = io.StringIO()
-            with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
-                main([*words, "--help"])
-            lines += [f"### `improvo {' '.join(words)}`", "", "```text", text.getvalue().strip(), "```", ""]
+    for words, _ in leaves():
+        text = io.StringIO()
+        with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+            main([*words, "--help"])
+        lines += [f"### `improvo {' '.join(words)}`", "", "```text", text.getvalue().strip(), "```", ""]
     return lines
-
-
-def _subcommands(verb: str) -> list[str]:
-    """The sub-commands of a verb, in their order."""
-    import importlib
-
-    from improvo.cli.main import COMMANDS
-
-    parser = argparse.ArgumentParser()
-    importlib.import_module(f"improvo.cli.{COMMANDS[verb][0]}").add_arguments(parser)
-    actions = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
-    return [name for action in actions for name in action.choices]
 
 
 def _model_cards() -> list[str]:

@@ -29,3 +29,22 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     walk = write_walk(folder / "walk", frames=30)
     assert main(["run", str(walk), "-o", str(folder / "out"), "--frontend", "orb", "--max-keypoints", "400"]) == 0
     return folder / "out"
+
+
+@pytest.fixture(scope="session")
+def long_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As `finished_run`, of 230 frames: the recorder writes its tables in more than one part. Not to be written to."""
+    from rendered_walk import write_walk
+
+    from improvo.cli.main import main
+
+    folder = tmp_path_factory.mktemp("long")
+    pictures = sorted(write_walk(folder / "walk", frames=24).glob("*.png"))
+    there_and_back = [*pictures, *reversed(pictures)] * 5
+    long = folder / "long"
+    long.mkdir()
+    for i, path in enumerate(there_and_back[:230]):
+        (long / f"{i:06d}.png").symlink_to(path)
+    (long / "camera.yaml").write_bytes((folder / "walk" / "camera.yaml").read_bytes())
+    assert main(["run", str(long), "-o", str(folder / "out"), "--frontend", "orb", "--max-keypoints", "150"]) == 0
+    return folder / "out"

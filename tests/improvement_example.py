@@ -17,10 +17,10 @@ import numpy as np
 
 from improvo.evaluation.settings import SurvivalSettings
 from improvo.files import make_output_folder, write_json
+from improvo.frontend.settings import FrontendSettings
 from improvo.frontend.weights import Weights, find_weights, load_weights, save_weights
 from improvo.improvement.improve import Improvement, improve
-from improvo.improvement.settings import HeldBackSettings, ImproveSettings, JudgeSettings
-from improvo.odometry.run_settings import FrontendSettings
+from improvo.improvement.settings import ImproveSettings, SplitSettings, ValidationSettings
 from improvo.odometry.settings import OdometrySettings, StartSettings
 from improvo.stability.settings import LabelSettings
 from improvo.training.settings import OdometryTrainingSettings
@@ -30,8 +30,10 @@ SETTINGS = ImproveSettings(
     frontend=FrontendSettings(SPOILED, max_keypoints=250),
     labels=LabelSettings(min_observations=6),
     odometry=OdometrySettings(start=StartSettings(max_homography_ratio=0.9)),  # the room is mostly one wall
-    held_back=HeldBackSettings(0.3),
-    judge=JudgeSettings(SurvivalSettings(gaps=(4, 8), pairs=6, min_pairs=2, max_keypoints=250), calibration_images=2),
+    split=SplitSettings(0.3),
+    validation=ValidationSettings(
+        SurvivalSettings(gaps=(4, 8), pairs=6, min_pairs=2, max_keypoints=250), calibration_images=2
+    ),
 )
 NOISE = (0.0, 0.5)  # of the first round, which gives the bundled weights back, and of the second, which ruins them
 

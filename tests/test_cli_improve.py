@@ -18,8 +18,15 @@ from improvo.improvement.settings import ImproveSettings
 
 OPTIONS = [
     *("--frontend", "superpoint-small", "--max-keypoints", "250", "--set", "labels.min_observations=6"),
-    *("--set", "judge.survival.gaps=[4,8]", "--set", "judge.survival.pairs=6", "--set", "judge.survival.min_pairs=2"),
-    *("--set", "held_back.share=0.3", "--set", "judge.calibration_images=2"),
+    *(
+        "--set",
+        "validation.survival.gaps=[4,8]",
+        "--set",
+        "validation.survival.pairs=6",
+        "--set",
+        "validation.survival.min_pairs=2",
+    ),
+    *("--set", "split.share=0.3", "--set", "validation.calibration_images=2"),
     *("--set", "odometry.start.max_homography_ratio=0.9"),  # the room is mostly one wall
 ]
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,11 +16,13 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import yaml
 from rendered_walk import write_walk
 
 from improvo.cli.main import main
-from improvo.labeling.labelled import read_labels
+from improvo.labeling.labeled import read_labels
 from improvo.stability.rule import STABLE
+from improvo.stability.tables import read_points
 
 OPTIONS = ["--frontend", "orb", "--max-keypoints", "300", "--set", "labels.min_observations=6"]
 
@@ -64,7 +68,7 @@ def test_the_store_reads_back(labelled: Path, walks: list[Path]) -> None:
     kitchen = sequences[1]
     assert (kitchen.points.stability == STABLE).sum() == kitchen.record.stable
     assert set(kitchen.tracks.track) == set(kitchen.points.track)
-    assert kitchen.frames.index.tolist() == list(range(22))
+    assert kitchen.frames.source_index.tolist() == list(range(22))
     picture = cv2.imread(str(walks[0] / "000007.png"), cv2.IMREAD_GRAYSCALE)
     np.testing.assert_array_equal(kitchen.image(7), picture)
 
@@ -101,6 +105,52 @@ def test_workers_give_the_same_bytes(labelled: Path, walks: list[Path], tmp_path
     assert contents(out) == contents(labelled)
 
 
+def test_run_and_label_give_the_same_labels(labelled: Path, walks: list[Path], tmp_path: Path) -> None:
+    for walk in walks[:2]:
+        out = tmp_path / walk.name
+        assert main(["run", str(walk), "-o", str(out), *OPTIONS]) == 0
+        for name in ("tracks.parquet", "points.parquet"):
+            assert (out / name).read_bytes() == (labelled / walk.name / name).read_bytes()
+        report = json.loads((out / "run.json").read_text())
+        assert report["tracks"] == json.loads((labelled / walk.name / "run.json").read_text())["tracks"]
+        assert report["tracks"]["stable"] > 20
+        assert set(report["quality"]) >= {"no_pose", "high_error", "little_parallax", "contradicted", "not_trusted"}
+
+
+def test_a_run_withholds_labels_where_its_settings_say_so(walks: list[Path], tmp_path: Path) -> None:
+    strict = ["--set", "labels.quality.min_median_parallax_deg=90"]
+    for name, options in (("withheld", strict), ("raw", [*strict, "--set", "labels.second_opinion.enabled=false"])):
+        assert main(["run", str(walks[0]), "-o", str(tmp_path / name), *OPTIONS, *options]) == 0
+    withheld, raw = (read_points(tmp_path / name / "points.parquet") for name in ("withheld", "raw"))
+    assert raw.counts()["withheld"] == 0 < raw.counts()["stable"]
+    assert withheld.counts() == {
+        "ignore": len(raw),
+        "unstable": 0,
+        "stable": 0,
+        "withheld": raw.counts()["stable"] + raw.counts()["unstable"],
+    }
+
+
+def test_a_store_of_a_former_version_goes_on(
+    labelled: Path, walks: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = shutil.copytree(labelled, tmp_path / "labels")
+    settings = yaml.safe_load((out / "settings.yaml").read_text())
+    settings["labels"]["second_opinion"] = settings["labels"].pop("quality")
+    settings["odometry"]["initialisation"] = settings["odometry"].pop("mode")
+    del settings["labels"]["loss_width"]  # as if it had come later
+    (out / "settings.yaml").write_text(yaml.safe_dump(settings))
+    before = contents(out)
+    assert main(["label", str(walks[0]), "-o", str(out), *OPTIONS]) == 0
+    assert contents(out) == before
+    assert read_labels(out)[0].rule.quality.enabled
+    settings["labels"]["stable_mean_error"] = 0.9
+    (out / "settings.yaml").write_text(yaml.safe_dump(settings))
+    capsys.readouterr()
+    assert main(["label", str(walks[0]), "-o", str(out), *OPTIONS]) == 2
+    assert "labels.stable_mean_error=0.9, now 1.0" in capsys.readouterr().err
+
+
 def test_packed_frames_need_no_recording(walks: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "labels"
     assert main(["label", str(walks[0]), "-o", str(out), "--pack", *OPTIONS]) == 0
@@ -110,6 +160,27 @@ def test_packed_frames_need_no_recording(walks: list[Path], tmp_path: Path) -> N
     packed = replace(sequence, folder=moved).image(5)
     picture = cv2.imread(str(walks[0] / "000005.png"), cv2.IMREAD_GRAYSCALE)
     assert np.abs(packed.astype(int) - picture).mean() < 3
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_termination_ends_the_command_and_the_next_one_goes_on(
+    labelled: Path, walks: list[Path], tmp_path: Path, workers: str
+) -> None:
+    out = tmp_path / "labels"
+    command = [sys.executable, "-m", "improvo", "label", *map(str, walks), "-o", str(out), "--workers", workers]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen([*command, *OPTIONS], env=environment, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 60
+        while not list(out.glob(".*.partial/.tracks*")) and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        process.terminate()
+        _, said = process.communicate(timeout=60)
+        assert process.returncode == 130
+    assert "improvo: interrupted" in said
+    assert "Traceback" not in said
+    assert main([*command[3:], *OPTIONS]) == 0
+    assert contents(out) == contents(labelled)
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")

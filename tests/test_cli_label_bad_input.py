@@ -14,7 +14,7 @@ import pytest
 from rendered_walk import write_walk
 
 from improvo.cli.main import main
-from improvo.labeling.labelled import read_labels
+from improvo.labeling.labeled import read_labels
 from improvo.labeling.store import DONE, SequenceRecord, read_records
 
 OPTIONS = ["--frontend", "orb", "--max-keypoints", "200", "--set", "labels.min_observations=6"]

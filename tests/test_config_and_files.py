@@ -66,9 +66,12 @@ def test_settings_under_their_former_names_are_read(tmp_path: Path) -> None:
 
 
 def test_every_former_name_leads_to_a_setting() -> None:
+    from improvo.improvement.settings import ImproveSettings
     from improvo.odometry.settings import OdometrySettings
+    from improvo.stability.settings import LabelSettings
 
-    now = {"odometry": config.to_dict(OdometrySettings())}
+    every = {"odometry": OdometrySettings(), "labels": LabelSettings(), "improve": ImproveSettings()}
+    now = {name: config.to_dict(settings) for name, settings in every.items()}
     now |= {name: value for name, value in now["odometry"].items() if isinstance(value, dict)}
     for section, names in config.FORMER_NAMES.items():
         for former, present in names.items():

@@ -70,7 +70,9 @@ def test_a_recording_is_counted_pair_by_pair(tmp_path: Path) -> None:
     (walk / "000005.png").write_bytes(b"no picture")
     ticks: list[None] = []
     sequence = open_sequence(walk)
-    first, second = surviving_matches(sequence, load_frontend("orb", 300), (4, 8), SETTINGS, lambda: ticks.append(None))
+    first, second = surviving_matches(
+        sequence, load_frontend("orb", 300, opencv_defaults=True), (4, 8), SETTINGS, lambda: ticks.append(None)
+    )
     assert (first.gap, second.gap) == (4, 8)
     assert len(ticks) == len(first.pairs) + len(second.pairs)
     assert 5 not in first.pairs  # cannot be read

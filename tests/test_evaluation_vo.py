@@ -14,7 +14,6 @@ from improvo.cli.main import main
 from improvo.errors import InputError
 from improvo.evaluation.settings import TrajectorySettings
 from improvo.evaluation.trajectory.tables import vo_tables
-from improvo.evaluation.vo import protocol
 from improvo.evaluation.vo.protocol import WITH, WITHOUT, evaluate_vo, usable
 from improvo.frontend import Frontend
 from improvo.geometry.se3 import rigid, so3_exp
@@ -138,7 +137,7 @@ def test_table_2_compares_both_variants_on_the_same_features(monkeypatch: pytest
     def knowing(name: str, max_keypoints: int) -> Frontend:
         return StabilityFrontend(IterablePlane(frames=40))
 
-    monkeypatch.setattr(protocol, "load_odometry_frontend", knowing)
+    monkeypatch.setattr("improvo.evaluation.vo.protocol.load_frontend", knowing)
     settings = TrajectorySettings(time_windows=(0.5,))
     sources: Any = [IterableSource()]
     outcomes, found = evaluate_vo(sources, ["knowing"], 500, OdometrySettings(mode="paper"), settings)

@@ -8,7 +8,8 @@ import pytest
 
 from improvo.errors import ConfigError
 from improvo.frontend.classical import spread_over_image
-from improvo.frontend.registry import CLASSICAL, load_frontend, load_odometry_frontend
+from improvo.frontend.registry import CLASSICAL, load_frontend
+from improvo.frontend.settings import NetworkOptions
 from improvo.types import UInt8
 
 
@@ -72,7 +73,7 @@ def test_colour_is_read_as_grey(picture: UInt8) -> None:
 
 def test_odometry_finds_points_on_a_weak_texture(picture: UInt8) -> None:
     weak = (100 + (picture.astype(np.float32) - 128) * 0.12).astype(np.uint8)
-    assert len(load_odometry_frontend("sift")(weak)) > 2 * len(load_frontend("sift")(weak))
+    assert len(load_frontend("sift")(weak)) > 2 * len(load_frontend("sift", opencv_defaults=True)(weak))
 
 
 def test_spreading_takes_from_every_cell_before_seconds() -> None:
@@ -86,5 +87,5 @@ def test_spreading_takes_from_every_cell_before_seconds() -> None:
 def test_unknown_names_and_options_are_refused() -> None:
     with pytest.raises(ConfigError, match="sift"):
         load_frontend("shift")
-    with pytest.raises(ConfigError, match="sensitivity"):
-        load_frontend("orb", sensitivity=3)
+    with pytest.raises(ConfigError, match="not a network"):
+        load_frontend("orb", network=NetworkOptions(threshold=0.1))

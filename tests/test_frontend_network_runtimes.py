@@ -155,8 +155,8 @@ def test_inference_needs_no_torch(tmp_path):
 import sys
 sys.modules["torch"] = sys.modules["onnx"] = None
 import numpy as np
-from improvo.frontend.registry import load_frontend
-features = load_frontend({str(path)!r}, max_keypoints=7, border=2)(np.random.default_rng(0).random((40, 50)))
+from improvo.frontend.network import load_network_frontend
+features = load_network_frontend({str(path)!r}, max_keypoints=7, border=2)(np.random.default_rng(0).random((40, 50)))
 assert len(features) == 7, len(features)
 """
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -10,7 +10,7 @@ import pytest
 
 from improvo.cli.main import main
 from improvo.errors import ConfigError
-from improvo.frontend.registry import load_odometry_frontend
+from improvo.frontend.registry import load_frontend
 from improvo.frontend.stable_only import StableOnly
 from improvo.simulation import bundled_sequence
 from improvo.types import Features
@@ -49,5 +49,5 @@ def test_the_shipped_head_drops_some_and_keeps_most() -> None:
     from improvo.sequences import open_sequence
 
     image = open_sequence(bundled_sequence())[60].image
-    everything, stable = (load_odometry_frontend("superpoint-vo", 500, least) for least in (0.0, 0.3))
+    everything, stable = (load_frontend("superpoint-vo", 500, least_stability=least) for least in (0.0, 0.3))
     assert 0.4 * len(everything(image)) < len(stable(image)) < len(everything(image))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "src" / "improvo"
 FLOORS = (
-    {"types", "config", "files", "errors", "compiled", "geometry", "jobs"},
+    {"types", "config", "files", "continuation", "terminal", "errors", "compiled", "geometry", "jobs"},
     {"sequences", "calibration", "frontend", "tracking", "simulation"},
     {"stability", "backend"},
     {"odometry"},
@@ -17,6 +17,7 @@ FLOORS = (
     {"evaluation"},
     {"report", "export"},
     {"improvement"},
+    {"verbs", "presets"},
     {"cli"},
 )
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}

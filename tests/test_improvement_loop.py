@@ -16,16 +16,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 from rendered_walk import write_walk
 
 from improvement_example import SETTINGS, FakeTraining, run
 from improvo.errors import ConfigError, ImprovoError, InputError, OutputError
 from improvo.frontend.weights import load_weights
 from improvo.improvement.improve import Improvement
-from improvo.improvement.judgement import Judgement, gain_interval, is_better, read_judgement, rule
-from improvo.improvement.settings import ImproveSettings, JudgeSettings
-from improvo.improvement.telling import Telling
-from improvo.labeling.labelled import read_labels
+from improvo.improvement.progress import ImprovementProgress
+from improvo.improvement.settings import ImproveSettings, ValidationSettings
+from improvo.improvement.validation import Validation, gain_interval, is_better, read_validation, rule
+from improvo.labeling.labeled import read_labels
 
 EXAMPLE = Path(__file__).with_name("improvement_example.py")
 LABEL_TABLES = ("tracks.parquet", "points.parquet", "frames.parquet", "trajectory.txt")
@@ -42,7 +43,7 @@ def finished(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Impr
     """Two rounds on it: the first mends spoiled weights, the second ruins them."""
     training, lines = FakeTraining(), list[str]()
     out = tmp_path_factory.mktemp("improve") / "out"
-    return run(out, [walk], training, telling=Telling(lines.append)), training, lines
+    return run(out, [walk], training, progress=ImprovementProgress(lines.append)), training, lines
 
 
 def starting(name: str) -> ImproveSettings:
@@ -55,7 +56,7 @@ def results(out: Path) -> dict[str, object]:
     found: dict[str, object] = {
         str(path.relative_to(out)): path.read_bytes()
         for path in sorted(out.rglob("*"))
-        if path.name in (*LABEL_TABLES, "split.json", "settings.yaml") and "training" not in path.parts
+        if path.name in (*LABEL_TABLES, "split.json") and "training" not in path.parts
     }
     for path in sorted(out.rglob("weights.safetensors")):
         for name, value in load_weights(path).tensors.items():
@@ -71,18 +72,18 @@ def test_training_never_sees_what_is_held_back(finished: tuple[Improvement, Fake
     for call in training.calls:
         (store,) = call["labels"]
         (labelled,) = read_labels(store)
-        assert labelled.frames.index.tolist() == list(range(28))
+        assert labelled.frames.source_index.tolist() == list(range(28))
         assert labelled.settings.end == 28
     for candidate in result.candidates[:2]:  # the last is too bad to track anything
         (judged,) = read_labels(candidate.held_back)
-        assert judged.frames.index.tolist() == list(range(28, 40))
+        assert judged.frames.source_index.tolist() == list(range(28, 40))
 
 
 def test_the_best_weights_are_kept_and_the_report_is_there(
     finished: tuple[Improvement, FakeTraining, list[str]],
 ) -> None:
     result, training, lines = finished
-    scores = [judgement.score for judgement in result.judgements]
+    scores = [validation.score for validation in result.validations]
     assert scores[2] < scores[0] < scores[1]
     assert result.best == 1
     kept, chosen = load_weights(result.weights), load_weights(result.candidates[1].weights)
@@ -95,7 +96,7 @@ def test_the_best_weights_are_kept_and_the_report_is_there(
     assert [call["start"] for call in training.calls] == [candidate.weights for candidate in result.candidates[:2]]
     assert [call["seed"] for call in training.calls] == [0, 1]
     page = (result.weights.parent / "report.html").read_text()
-    assert rule(SETTINGS.judge) in page
+    assert rule(SETTINGS.validation) in page
     assert "the last 12 of 40 frames of room" in page
     assert "Kept: round 1; " in page
     assert page.count("data:image/png") == 4  # matches and labels of the start and of the best
@@ -147,6 +148,22 @@ def test_other_settings_are_refused_and_what_a_kill_left_is_cleared_away(
     assert not any(leftover.exists() for leftover in leftovers)
 
 
+def test_a_folder_of_a_former_version_goes_on(
+    walk: Path, finished: tuple[Improvement, FakeTraining, list[str]]
+) -> None:
+    path = finished[0].weights.parent / "settings.yaml"
+    values = yaml.safe_load(path.read_text())
+    values["judge"], values["held_back"] = values.pop("validation"), values.pop("split")
+    values["labels"]["second_opinion"] = values["labels"].pop("quality")
+    for name in ("device", "threads", "workers", "checkpoint_minutes", "log_every"):
+        del values["training"]["optimiser"][name]
+    path.write_text(yaml.safe_dump(values))
+    training = FakeTraining()
+    assert run(path.parent, [walk], training).best == finished[0].best
+    assert training.calls == []
+    assert yaml.safe_load(path.read_text())["split"] == {"share": 0.3}
+
+
 def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(walk: Path, tmp_path: Path) -> None:
     good = [walk, write_walk(tmp_path / "hall", frames=30, seed=1)]
     black, short, cut = tmp_path / "black", tmp_path / "short", tmp_path / "cut"
@@ -162,7 +179,7 @@ def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(wa
     try:
         training, lines = FakeTraining(), list[str]()
         sequences = [black, good[0], tmp_path / "missing", good[1]]
-        result = run(tmp_path / "out", sequences, training, rounds=1, telling=Telling(lines.append))
+        result = run(tmp_path / "out", sequences, training, rounds=1, progress=ImprovementProgress(lines.append))
     finally:
         (walk / "gone").replace(walk / "000004.png")
     text = "\n".join(lines)
@@ -172,7 +189,7 @@ def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(wa
     (store,) = training.calls[0]["labels"]
     (labelled,) = read_labels(store)
     assert labelled.name == "room"
-    assert 4 not in labelled.frames.index  # unreadable
+    assert 4 not in labelled.frames.source_index  # unreadable
     assert [found.name for found in read_labels(result.candidates[0].held_back)] == ["hall"]
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Left out: black: " in page
@@ -189,23 +206,23 @@ def test_weights_without_activation_ranges_get_them_from_frames_that_are_not_hel
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from improvo.frontend.weights import find_weights, save_weights
-    from improvo.improvement import steps
-    from improvo.improvement.workspace import Workspace
+    from improvo.improvement import rounds
+    from improvo.improvement.folder import ImproveFolder
 
     bundled = load_weights(find_weights("superpoint-small"))
     mine = tmp_path / "mine.safetensors"
     save_weights(mine, bundled.tensors, replace(bundled.card, activation_ranges={}))
     seen: list[np.ndarray] = []
-    calibrate = steps.write_calibrated
+    calibrate = rounds.write_calibrated
     monkeypatch.setattr(
-        steps,
+        rounds,
         "write_calibrated",
         lambda source, target, images: (seen.extend(images), calibrate(source, target, images)),
     )
-    workspace = Workspace(tmp_path / "out", [walk], [], starting(str(mine)), mine)
-    loop = steps.Steps(workspace, starting(str(mine)), FakeTraining(), (), None, None, Telling())
-    split = loop.hold_back([walk], [], mine)
-    candidate = loop.begin(mine, split.training)
+    folder = ImproveFolder(tmp_path / "out", [walk], [], starting(str(mine)), mine)
+    loop = rounds.Rounds(folder, starting(str(mine)), FakeTraining(), (), None, None, ImprovementProgress())
+    split = loop.split([walk], [], mine)
+    candidate = loop.start(mine, split.training)
     assert load_weights(candidate.weights).card.activation_ranges
     training = [cv2.imread(str(walk / f"{i:06d}.png"), cv2.IMREAD_GRAYSCALE) for i in range(28)]
     assert len(seen) == 2
@@ -222,25 +239,25 @@ def test_a_run_that_ends_after_each_of_its_steps_goes_on(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from improvo.improvement.steps import Steps
+    from improvo.improvement.rounds import Rounds
 
     made: list[str] = []
 
     def stop_after(name: str) -> None:
-        step = getattr(Steps, name)
+        step = getattr(Rounds, name)
 
-        def stopping(steps: Steps, *arguments: object) -> object:
-            there = name != "label" and arguments[0].judgement.is_file()  # type: ignore[attr-defined]
-            done = step(steps, *arguments)
+        def stopping(rounds: Rounds, *arguments: object) -> object:
+            there = name != "label" and arguments[0].validation.is_file()  # type: ignore[attr-defined]
+            done = step(rounds, *arguments)
             key = f"{name} {len(training.calls)} {arguments[0]}"
             if key not in made and not there:
                 made.append(key)
                 raise StoppedError
             return done
 
-        monkeypatch.setattr(Steps, name, stopping)
+        monkeypatch.setattr(Rounds, name, stopping)
 
-    for name in ("label", "learn", "judge"):
+    for name in ("label", "train", "validate"):
         stop_after(name)
     training = FakeTraining()
     stops = 0
@@ -250,7 +267,7 @@ def test_a_run_that_ends_after_each_of_its_steps_goes_on(
             break
         except StoppedError:
             stops += 1
-    assert stops == len(made) >= 7  # three judgements, two rounds of labelling and learning
+    assert stops == len(made) >= 7  # three validations, two rounds of labelling and learning
     assert len(training.calls) == 2
     assert results(tmp_path / "out") == results(finished[0].weights.parent)
 
@@ -302,29 +319,29 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on_later(
     assert results(out) == results(finished[0].weights.parent)
 
 
-def judgement(agreeing: list[int], tracked: int = 100) -> Judgement:
-    return Judgement(100, tracked, 8.0, 0.8, 0.5, {}, {"30": agreeing}, {"30": 0.1})
+def validation(agreeing: list[int], tracked: int = 100) -> Validation:
+    return Validation(100, tracked, 8.0, 0.8, 0.5, {}, {"30": agreeing}, {"30": 0.1})
 
 
 def test_better_is_more_matches_without_losing_frames() -> None:
-    settings = JudgeSettings()
-    start = judgement([40, 50, 60] * 5)
-    assert is_better(judgement([42, 51, 62] * 5), start, settings)
-    assert not is_better(judgement([40, 50, 60] * 5), start, settings)
-    assert not is_better(judgement([60, 40, 52] * 5), start, settings)  # more, by chance
-    assert is_better(judgement([80, 90, 99] * 5, tracked=99), start, settings)
-    assert not is_better(judgement([80, 90, 99] * 5, tracked=98), start, settings)
-    assert is_better(judgement([80, 90, 99] * 5, tracked=98), start, replace(settings, frames_lost=0.05))
+    settings = ValidationSettings()
+    start = validation([40, 50, 60] * 5)
+    assert is_better(validation([42, 51, 62] * 5), start, settings)
+    assert not is_better(validation([40, 50, 60] * 5), start, settings)
+    assert not is_better(validation([60, 40, 52] * 5), start, settings)  # more, by chance
+    assert is_better(validation([80, 90, 99] * 5, tracked=99), start, settings)
+    assert not is_better(validation([80, 90, 99] * 5, tracked=98), start, settings)
+    assert is_better(validation([80, 90, 99] * 5, tracked=98), start, replace(settings, frames_lost=0.05))
 
 
 def test_the_interval_of_a_gain_is_over_pairs() -> None:
     rng = np.random.default_rng(1)
     before = rng.integers(20, 80, 50)
-    low, high = gain_interval(judgement((before + 5).tolist()), judgement(before.tolist()))
+    low, high = gain_interval(validation((before + 5).tolist()), validation(before.tolist()))
     assert low == pytest.approx(5)
     assert high == pytest.approx(5)
     after = before + rng.normal(0, 20, 50).round().astype(int)
-    low, high = gain_interval(judgement(after.tolist()), judgement(before.tolist()))
+    low, high = gain_interval(validation(after.tolist()), validation(before.tolist()))
     assert low < 0 < high
     assert high - low < 20
 
@@ -332,7 +349,7 @@ def test_the_interval_of_a_gain_is_over_pairs() -> None:
 def test_a_damaged_judgement_is_named(tmp_path: Path) -> None:
     (tmp_path / "judgement.json").write_text("{")
     with pytest.raises(InputError, match="measured again"):
-        read_judgement(tmp_path / "judgement.json")
+        read_validation(tmp_path / "judgement.json")
 
 
 def test_a_folder_of_something_else_is_refused(walk: Path, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ def test_labels_are_raw_and_follow_the_rule_of_the_paper() -> None:
     labels = paper_run_settings().labels
     assert (labels.min_observations, labels.stable_mean_error, labels.unstable_max_error) == (10, 1.0, 5.0)
     assert labels.loss == "huber"
-    assert not labels.second_opinion.enabled
+    assert not labels.quality.enabled
 
 
 def test_observations_are_weighted_with_the_stability() -> None:

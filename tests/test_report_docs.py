@@ -15,10 +15,21 @@ from pathlib import Path
 
 import pytest
 
-from improvo.cli.main import COMMANDS, main
+from improvo.cli.commands import COMMANDS
+from improvo.cli.main import main
 
 ROOT = Path(__file__).parents[1]
-PAGES = ("index", "tutorial", "commands", "pictures", "export", "conventions", "paper-to-code", "reference")
+PAGES = (
+    "index",
+    "tutorial",
+    "architecture",
+    "commands",
+    "pictures",
+    "export",
+    "conventions",
+    "paper-to-code",
+    "reference",
+)
 
 
 def text_of(page: str) -> str:
@@ -56,6 +67,15 @@ def test_names_of_modules_and_functions_exist(page: str) -> None:
         assert len(names) > 20
 
 
+@pytest.mark.parametrize("page", ["README.md", "docs/architecture.md"])
+def test_places_in_the_code_exist(page: str) -> None:
+    text = (ROOT / page).read_text()
+    places = re.findall(r"`([a-z_]+/(?:[\w/]+\.py)?)`", text)
+    assert len(places) > 7
+    for place in places:
+        assert (ROOT / "src" / "improvo" / place).exists() or (ROOT / place).exists(), place
+
+
 @cache
 def help_of(words: tuple[str, ...]) -> str:
     text = io.StringIO()
@@ -71,8 +91,7 @@ def test_commands_and_their_options_exist(page: str) -> None:
     for command in commands:
         words = command.split()
         assert words[1] in COMMANDS, command
-        has_subs = words[1] in ("show", "evaluate", "export", "train", "weights")
-        verb = (words[1], words[2]) if has_subs and len(words) > 2 else (words[1],)
+        verb = (words[1], words[2]) if COMMANDS[words[1]].parts and len(words) > 2 else (words[1],)
         text = help_of(verb)
         assert "usage:" in text, command
         assert "invalid choice" not in text, command

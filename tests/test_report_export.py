@@ -186,7 +186,7 @@ def test_segments_are_models_of_their_own_the_longest_first(
     assert "only the longest of 2 segments: 12 frames" in capsys.readouterr().out
     assert main(["show", "map", str(run)]) == 0
     assert main(["report", str(run)]) == 0
-    assert "2 pieces (new ones start at frames 18)" in (run / "report.html").read_text()
+    assert "2 segments (new ones start at frames 18)" in (run / "report.html").read_text()
 
 
 def test_an_export_does_not_touch_a_folder_of_others(

@@ -73,6 +73,28 @@ def test_page_is_one_file_without_network(page: Path) -> None:
     assert page.stat().st_size < 3e6
 
 
+def test_no_page_names_the_folders_of_this_machine_and_each_names_its_recording(
+    page: Path, finished_run: Path, tmp_path: Path
+) -> None:
+    labels, evaluation = tmp_path / "labels", tmp_path / "evaluation"
+    walk = finished_run.parent / "walk"
+    words = [str(walk), "-o", str(labels), "--frontend", "orb", "--max-keypoints", "400"]
+    assert main(["label", *words]) == 0
+    truth = str(finished_run / "trajectory.txt")
+    assert main(["evaluate", "trajectory", str(finished_run), truth, "-o", str(evaluation)]) == 0
+    pages = [page]
+    for folder in (labels, evaluation):
+        assert main(["report", str(folder)]) == 0
+        pages.append(folder / "report.html")
+    for path in pages:
+        text = path.read_text()
+        assert str(tmp_path) not in text
+        assert str(finished_run.parent) not in text
+        title = re.search("<title>(.*)</title>", text)
+        assert title is not None
+        assert "walk" in title[1] or "out" in title[1]  # the recording, or the estimate
+
+
 def test_browser_loads_it_without_errors_and_slider_and_map_respond(page: Path, browser: Any) -> None:
     from selenium.webdriver.common.action_chains import ActionChains
     from selenium.webdriver.common.keys import Keys
@@ -175,7 +197,7 @@ def test_what_is_wrong_is_said_in_plain_words() -> None:
     waiting = {"frame_index": 2, "kind": "initialising", "detail": "too little parallax"}
     assert "too little parallax" in words(report(frames=none, events=[waiting]))
     assert "Dark frames (mean grey value under 25 of 255): 0" in words(report(), brightness=9.0)
-    assert "2 pieces" in words(report(segments=[{"first": 0}, {"first": 6}]))
+    assert "2 segments" in words(report(segments=[{"first": 0}, {"first": 6}]))
     assert "Check the calibration" in words(report(), error=2.5)
     skipped = [{"index": 3, "source": "a.png", "reason": "truncated"}]
     assert "a.png: truncated" in words(report(input={"skipped": skipped, "notes": []}))

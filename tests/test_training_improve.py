@@ -21,8 +21,22 @@ from improvo.frontend.weights import load_weights, save_weights
 
 COMMAND = [
     *("--frontend", "superpoint-small", "--max-keypoints", "250", "--steps", "6", "--batch-size", "2"),
-    *("--set", "labels.min_observations=6", "--set", "judge.survival.gaps=[4,8]", "--set", "judge.survival.pairs=4"),
-    *("--set", "judge.survival.min_pairs=2", "--set", "held_back.share=0.3", "--set", "judge.calibration_images=2"),
+    *(
+        "--set",
+        "labels.min_observations=6",
+        "--set",
+        "validation.survival.gaps=[4,8]",
+        "--set",
+        "validation.survival.pairs=4",
+    ),
+    *(
+        "--set",
+        "validation.survival.min_pairs=2",
+        "--set",
+        "split.share=0.3",
+        "--set",
+        "validation.calibration_images=2",
+    ),
     *("--set", "odometry.start.max_homography_ratio=0.9"),  # the room is mostly one wall
     *("--set", "training.optimiser.checkpoint_minutes=0", "--set", "training.optimiser.log_every=1"),
     *("--set", "training.optimiser.workers=0", "--threads", "1"),

@@ -16,9 +16,9 @@ from improvo.cli.main import main  # noqa: E402
 from improvo.frontend.architecture import Architecture  # noqa: E402
 from improvo.frontend.superpoint import SuperPoint, sample_stability  # noqa: E402
 from improvo.frontend.weights import ModelCard, load_weights, save_weights  # noqa: E402
-from improvo.labeling.labelled import read_labels  # noqa: E402
+from improvo.labeling.labeled import read_labels  # noqa: E402
 from improvo.stability.rule import IGNORE, STABLE, UNSTABLE  # noqa: E402
-from improvo.training.labelled_frames import LabelledFrames, common_points  # noqa: E402
+from improvo.training.labeled_frames import LabeledFrames, common_points  # noqa: E402
 from improvo.training.labels import IGNORED  # noqa: E402
 from improvo.training.losses import info_nce_loss, stability_loss  # noqa: E402
 from improvo.training.settings import (  # noqa: E402
@@ -30,7 +30,7 @@ from improvo.training.settings import (  # noqa: E402
 )
 from improvo.training.stages import loaded  # noqa: E402
 from improvo.training.tracked_pairs import TrackedPairs  # noqa: E402
-from labelled_scene import (  # noqa: E402
+from labeled_scene import (  # noqa: E402
     CAMERA,
     FAR,
     FRAMES,
@@ -39,7 +39,7 @@ from labelled_scene import (  # noqa: E402
     draw,
     project,
     scene_points,
-    write_labelled_scene,
+    write_labeled_scene,
 )
 
 TINY = Architecture("tiny", encoder=(4, 4, 4, 4, 8, 8, 8, 8), head=8, descriptor=8, stability=False)
@@ -52,7 +52,7 @@ LATE = HALF + 20  # a frame in which no track follows the odd far points any mor
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_labelled_scene(tmp_path_factory.mktemp("scene") / "labels")
+    return write_labeled_scene(tmp_path_factory.mktemp("scene") / "labels")
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +64,8 @@ def tiny_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def frames_of(store: Path, settings: LandmarkSettings) -> LabelledFrames:
-    return LabelledFrames(read_labels(store)[0], 160, settings)
+def frames_of(store: Path, settings: LandmarkSettings) -> LabeledFrames:
+    return LabeledFrames(read_labels(store)[0], 160, settings)
 
 
 def truth(frame: int, kind: str) -> np.ndarray:
@@ -109,7 +109,7 @@ def test_a_point_that_no_track_sees_is_known_where_its_projection_is_visible(sto
 
 
 def test_stable_points_lie_at_their_projections(tmp_path: Path) -> None:
-    noisy = write_labelled_scene(tmp_path / "noisy", keypoint_noise=0.8)
+    noisy = write_labeled_scene(tmp_path / "noisy", keypoint_noise=0.8)
     at_keypoint, at_projection = (frames_of(noisy, s).points(20) for s in (TRACKS_ONLY, LandmarkSettings(unseen=False)))
     exact = np.array([project(point, 20) for point in scene_points()])
     stable = at_keypoint.stability == STABLE
@@ -118,15 +118,15 @@ def test_stable_points_lie_at_their_projections(tmp_path: Path) -> None:
 
 
 def test_an_unstable_label_of_one_wrong_link_does_not_teach(tmp_path: Path) -> None:
-    jumps = write_labelled_scene(tmp_path / "jumps", unstable_error=0.6)  # the median of the errors, not their largest
+    jumps = write_labeled_scene(tmp_path / "jumps", unstable_error=0.6)  # the median of the errors, not their largest
     published, sure = (frames_of(jumps, s).points(5).stability for s in (PAPER, LandmarkSettings(unseen=False)))
     assert (published == UNSTABLE).sum() > 20
     assert not (sure == UNSTABLE).any()
 
 
 def test_a_thing_that_moves_teaches_and_a_track_that_jumps_once_does_not(tmp_path: Path) -> None:
-    moves = write_labelled_scene(tmp_path / "moves")
-    jumps = write_labelled_scene(tmp_path / "jumps", wrong_link=True)
+    moves = write_labeled_scene(tmp_path / "moves")
+    jumps = write_labeled_scene(tmp_path / "jumps", wrong_link=True)
     everything = LandmarkSettings(unseen=False, unstable_largest_step=1.0)
     for store, taught in ((moves, True), (jumps, False)):
         labelled = (frames_of(store, everything).points(5).stability == UNSTABLE).sum()
@@ -258,7 +258,7 @@ def test_the_command_teaches_stability_and_says_so_on_the_card(
     stable = (logits[:, 1] - logits[:, 0]).numpy()
     assert np.mean(stable[known.stability == STABLE]) > np.mean(stable[known.stability == UNSTABLE]) + 1
 
-    other = write_labelled_scene(tmp_path / "other", name="other")
+    other = write_labeled_scene(tmp_path / "other", name="other")
     command[2] = str(other)
     assert main([*command, "--config", str(config)]) == 2
     assert "other labels" in capsys.readouterr().err

@@ -16,6 +16,8 @@ T = TypeVar("T")
 # Settings that were renamed: the section, what a setting there was called, and what it is called now. Files that were
 # written under a former name stay readable.
 FORMER_NAMES: dict[str, dict[str, str]] = {
+    "labels": {"second_opinion": "quality"},
+    "improve": {"held_back": "split", "judge": "validation"},
     "odometry": {"initialisation": "mode", "trust": "ransac_gate"},
     "matching": {
         "max_stray": "flow_outlier_limit",
@@ -47,15 +49,21 @@ def to_yaml(settings: Any) -> str:
     return yaml.safe_dump(to_dict(settings), sort_keys=False)
 
 
-def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = ()) -> T:
-    """Settings of type `cls` from defaults, a YAML file and `a.b=value` overrides, in that order.
+def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = (), base: T | None = None) -> T:
+    """Settings of type `cls` from defaults (or `base`, such as a preset), a YAML file and `a.b=value` overrides.
+
+    Args:
+        cls: a frozen dataclass of settings.
+        path: YAML file with some or all of them.
+        overrides: `section.name=value` each; they win over the file.
+        base: what counts where neither says anything; the defaults if None.
 
     Raises:
         ConfigError: a file that is no YAML mapping, an unknown key, or a value of the wrong type.
     """
     import yaml
 
-    section = _section_of(cls)
+    section = section_of(cls)
     merged: dict[str, Any] = {}
     if path is not None:
         try:
@@ -83,11 +91,17 @@ def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = ()) 
             target[_present_name(below, leaf)] = yaml.safe_load(text)
         except yaml.YAMLError:
             raise ConfigError(f"--set {override}: the value is not readable") from None
-    return from_dict(cls, merged, where=str(path) if path else "settings")
+    return from_dict(cls, merged, str(path) if path else "settings", base)
 
 
-def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings") -> T:
-    """Build the dataclass `cls` from nested dictionaries.
+def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings", base: T | None = None) -> T:
+    """Build the dataclass `cls` from nested dictionaries; what they leave out is as in `base`, or as in the defaults.
+
+    Args:
+        cls: a frozen dataclass of settings.
+        values: some or all of them, under present or former names.
+        where: what to call the source in a message.
+        base: what counts where `values` says nothing; the defaults if None.
 
     Raises:
         ConfigError: an unknown key (with the nearest known one) or a value of the wrong type.
@@ -95,11 +109,13 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings") -> 
     import cattrs
     from cattrs.errors import ClassValidationError
 
-    values = with_present_names(values, _section_of(cls))
+    values = with_present_names(values, section_of(cls))
     _refuse_unknown_keys(cls, values, where, prefix="")
-    if all(_has_default(field) for field in dataclasses.fields(cls)):  # type: ignore[arg-type]
+    if base is None and all(_has_default(field) for field in dataclasses.fields(cls)):  # type: ignore[arg-type]
+        base = cls()
+    if base is not None:
         # a section given in part keeps what this class has for the rest of it, not the section's own defaults
-        values = _over(to_dict(cls()), values)
+        values = over(to_dict(base), values)
     converter = cattrs.Converter(forbid_extra_keys=True)
     converter.register_structure_hook(bool, _strict(bool))
     converter.register_structure_hook(int, _strict(int))
@@ -134,33 +150,22 @@ def _present_name(section: str, key: Any) -> Any:
     return FORMER_NAMES.get(section, {}).get(key, key)
 
 
-def _section_of(cls: type) -> str:
+def section_of(cls: type) -> str:
     """`odometry` for `OdometrySettings`."""
     return cls.__name__.removesuffix("Settings").lower()
 
 
-def first_difference(before: Any, now: Any, prefix: str = "") -> str:
-    """The first setting that differs between two nested dictionaries, in words; empty where none does."""
-    if not (isinstance(before, dict) and isinstance(now, dict)):
-        return "" if before == now else f"{prefix.rstrip('.')}={before}, now {now}"
-    for key in [*before, *(key for key in now if key not in before)]:
-        difference = first_difference(before.get(key), now.get(key), f"{prefix}{key}.")
-        if difference:
-            return difference
-    return ""
-
-
-def _has_default(field: dataclasses.Field[Any]) -> bool:
-    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
-
-
-def _over(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+def over(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
     """Nested dictionaries: the values, and the defaults where there is none."""
     result = dict(defaults)
     for key, value in values.items():
         below = result.get(key)
-        result[key] = _over(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+        result[key] = over(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
     return result
+
+
+def _has_default(field: dataclasses.Field[Any]) -> bool:
+    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
 
 def _strict(kind: type) -> Any:

@@ -1,4 +1,4 @@
-"""`improvo calibrate RECORDING --board 9x6:25mm`, and `improvo calibrate --print-board board.pdf --board 9x6:25mm`."""
+"""A camera from a recording of a board (`--board 9x6:25mm`), and the board to print (`--print-board board.pdf`)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from improvo.cli.output import next_step, say
 from improvo.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
@@ -47,47 +48,47 @@ def run(arguments: argparse.Namespace) -> None:
     board = parse_board(arguments.board)
     if arguments.print_board is not None:
         print_board(board, arguments.print_board, arguments.paper)
-        print(f"{arguments.print_board}: print it at 100 %, check the ruler, glue it to something flat")
+        say(f"{arguments.print_board}: print it at 100 %, check the ruler, glue it to something flat")
         return
     if arguments.recording is None:
         raise ConfigError("give a recording of the board, or --print-board FILE.pdf to make one")
     if min(arguments.samples, arguments.views) < 1:
         raise ConfigError("--samples and --views must be at least 1")
-    from tqdm import tqdm
-
     from improvo.calibration.from_board import calibrate, write_camera, write_coverage
     from improvo.sequences.base import SequenceSettings, sampled_pictures
     from improvo.sequences.opening import open_recording
+    from improvo.terminal import progress
 
     settings = SequenceSettings(format=arguments.format, topic=arguments.topic)
     recording = open_recording(arguments.recording, settings)
     found = 0
-    with tqdm(total=min(arguments.samples, len(recording)), unit="frame", desc="calibrate", leave=False) as bar:
+    with progress("calibrate", "frame", min(arguments.samples, len(recording))) as shown:
 
-        def progress(seen: bool) -> None:
+        def told(seen: bool) -> None:
             nonlocal found
             found += seen
-            bar.update()
-            bar.set_postfix(found=found, refresh=False)
+            shown.note(f"the board in {found}")
+            shown.advance()
 
         pictures = sampled_pictures(recording, arguments.samples)
         try:
-            fit = calibrate(pictures, board, arguments.model, arguments.views, progress)
+            fit = calibrate(pictures, board, arguments.model, arguments.views, told)
         except InputError as error:
             raise InputError(f"{recording.path}: {error}") from None
     picture = arguments.output.with_name(f"{arguments.output.stem}-coverage.png")
     write_camera(arguments.output, fit)
     write_coverage(picture, fit)
     _print(fit, arguments.recording)
-    print(f"written: {arguments.output}, {picture}")
+    say(f"written: {arguments.output}, {picture}")
+    next_step(f"`improvo run VIDEO --camera {arguments.output} -o out`")
 
 
 def _print(fit: CameraFit, path: Path) -> None:
     camera = fit.camera
-    print(f"{path}: {camera.width}x{camera.height}, {len(fit.views)} views, model {fit.model}, RMS {fit.rms:.3f} px")
+    say(f"{path}: {camera.width}x{camera.height}, {len(fit.views)} views, model {fit.model}, RMS {fit.rms:.3f} px")
     others = ", ".join(f"{name} {rms:.3f}" for name, rms in fit.tried.items() if name != fit.model)
     if others:
-        print(f"  others tried (RMS): {others}")
+        say(f"  others tried (RMS): {others}")
     values = dict(zip(("fx", "fy", "cx", "cy"), (camera.fx, camera.fy, camera.cx, camera.cy), strict=True))
     if camera.distortion_model == "fisheye":
         names: tuple[str, ...] = ("k1", "k2", "k3", "k4")
@@ -95,5 +96,5 @@ def _print(fit: CameraFit, path: Path) -> None:
         names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     values |= dict(zip(names, camera.distortion, strict=False))
     for name, value in values.items():
-        print(f"  {name:<3} {value:12.6g}  +- {fit.deviations.get(name, float('nan')):.2g}")
-    print(f"  the board reached {100 * float((fit.coverage > 0).mean()):.0f} % of the picture")
+        say(f"  {name:<3} {value:12.6g}  +- {fit.deviations.get(name, float('nan')):.2g}")
+    say(f"  the board reached {100 * float((fit.coverage > 0).mean()):.0f} % of the picture")

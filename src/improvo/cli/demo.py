@@ -1,15 +1,17 @@
-"""`improvo demo`: the main job on the bundled recording, command by command, so that a newcomer sees what to type.
+"""The main job on the bundled recording, command by command, so that a newcomer sees what to type.
 
 Odometry with a network, its pictures, then `improvo improve` on the same recording, and odometry with what that has
-learned. A few minutes; run it again to continue one that was stopped.
+learned. A few minutes; run it again to continue one that was stopped. Without the extra `train` the first half is done.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import shlex
 from pathlib import Path
 
+from improvo.cli.output import next_step, say
 from improvo.errors import ImprovoError
 
 _STEPS = 400
@@ -28,32 +30,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run, compare with the truth, draw, improve, and run again; prints each command before it runs."""
-    from improvo.cli.train_options import need_torch
     from improvo.files import make_output_folder
     from improvo.simulation import bundled_sequence
 
-    need_torch()
+    def do(*words: object) -> None:
+        _do([*map(str, words), *(["--quiet"] if arguments.quiet else [])])
+
     make_output_folder(arguments.output, "demo")
     recording = bundled_sequence()
     before, improved, after = (arguments.output / name for name in ("run", "improve", "run-improved"))
     truth = recording / "groundtruth.txt"
-    print(f"A simulated room of 140 frames, with its true poses: {recording}")
-    _do("run", recording, "-o", before, "--frontend", arguments.frontend)
-    _do("evaluate", "trajectory", before / "trajectory.txt", truth)
-    _do("show", "map", before)
-    _do("show", "tracks", before)
-    _do("show", "labels", before)
-    _do("report", before)
-    print("\nNow the frontend learns from the labels of this room, and is judged on the part that it never saw.")
-    held_back = ("--set", "held_back.share=0.4")  # of so short a recording, for pairs 30 frames apart
-    _do("improve", recording, "-o", improved, "--frontend", arguments.frontend, "--steps", arguments.steps, *held_back)
-    _do("run", recording, "-o", after, "--frontend", improved / "weights.safetensors")
-    _do("evaluate", "trajectory", after / "trajectory.txt", truth)
-    print(f"\nDone. Look at {improved / 'report.html'}, {before / 'report.html'} and {before / 'pictures'}.")
+    say(f"A simulated room of 140 frames, with its true poses: {recording}")
+    do("run", recording, "-o", before, "--frontend", arguments.frontend)
+    do("evaluate", "trajectory", before / "trajectory.txt", truth)
+    do("show", "map", before)
+    do("show", "tracks", before)
+    do("show", "labels", before)
+    do("report", before)
+    if importlib.util.find_spec("torch") is None:
+        say("\nThe rest, where the frontend learns from this room, needs an extra: pip install 'improvo[train]'")
+        next_step(f"open {before / 'report.html'}, or install the extra and run `improvo demo` again")
+        return 0
+    say("\nNow the frontend learns from the labels of this room, and is validated on the part that it never saw.")
+    held_out = ("--set", "split.share=0.4")  # of so short a recording, for pairs 30 frames apart
+    do("improve", recording, "-o", improved, "--frontend", arguments.frontend, "--steps", arguments.steps, *held_out)
+    do("run", recording, "-o", after, "--frontend", improved / "weights.safetensors")
+    do("evaluate", "trajectory", after / "trajectory.txt", truth)
+    next_step(f"open {improved / 'report.html'}, {before / 'report.html'} and the pictures in {before / 'pictures'}")
     return 0
 
 
-def _do(*words: object) -> None:
+def _do(words: list[str]) -> None:
     """One command, as if typed.
 
     Raises:
@@ -61,8 +68,7 @@ def _do(*words: object) -> None:
     """
     from improvo.cli.main import main
 
-    texts = [str(word) for word in words]
-    print(f"\n$ improvo {shlex.join(texts)}", flush=True)
-    status = main(texts)
+    say(f"\n$ improvo {shlex.join(words)}")
+    status = main(words)
     if status:
-        raise ImprovoError(f"the demo stopped: `improvo {texts[0]}` ended with status {status}")
+        raise ImprovoError(f"the demo stopped: `improvo {words[0]}` ended with status {status}")

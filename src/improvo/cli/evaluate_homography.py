@@ -11,6 +11,7 @@ from pathlib import Path
 
 from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments
 from improvo.cli.options import add_config_arguments, settings_from
+from improvo.cli.output import figures, next_step
 from improvo.errors import InputError
 from improvo.evaluation.settings import HomographyCommandSettings, HomographySettings
 
@@ -53,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int | None:
     from improvo.cli.evaluate_options import loaded_frontends
     from improvo.evaluation.homography.pairs import hpatches_scenes, picture_scenes
     from improvo.evaluation.homography.protocol import homography_table, run_homography_protocol
-    from improvo.files import make_output_folder, write_json, write_text
+    from improvo.files import check_output_folder, make_output_folder, write_json, write_text
     from improvo.jobs.pool import Workers
 
     settings = settings_from(HomographyCommandSettings, arguments, _FLAGS).homography
@@ -66,14 +67,16 @@ def run(arguments: argparse.Namespace) -> int | None:
     else:
         scenes = hpatches_scenes(arguments.folder)
     if arguments.output is not None:
-        make_output_folder(arguments.output, COMMAND)
+        check_output_folder(arguments.output, COMMAND)
     frontends, skipped = loaded_frontends(arguments.frontend, settings.max_keypoints)
     with Workers(arguments.workers, progress=True) as workers:
         found = run_homography_protocol(scenes, frontends, settings, workers)
     results = {"protocol": "homography", "improvo": __version__, **found, "skipped_frontends": skipped}
     text = homography_table(results)
-    print(text, end="")
+    figures(results, text)
     if arguments.output is not None:
+        make_output_folder(arguments.output, COMMAND)
         write_json(arguments.output / "homography.json", results)
         write_text(arguments.output / "homography.md", text)
+        next_step(f"`improvo report {arguments.output}` makes a page of it")
     return 0

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments, add_truth_argument
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.output import figures, next_step, say
 from improvo.errors import ImprovoError, InputError
 from improvo.evaluation.settings import ESTIMATORS, SAMPLINGS, PoseCommandSettings, PoseSettings
 
@@ -86,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int | None:
 
     if arguments.results is not None:
         results = read_results(arguments.results)
-        print(pose_tables(results, arguments.per_sequence), end="")
+        figures(results, pose_tables(results, arguments.per_sequence))
         _draw(results, arguments.results.parent if arguments.output is None else arguments.output)
         return 0
     if not arguments.sequences:
@@ -94,7 +95,9 @@ def run(arguments: argparse.Namespace) -> int | None:
     if arguments.export_images is not None:
         return _export(arguments)
     results = _evaluate(arguments)
-    print(pose_tables(results, arguments.per_sequence), end="")
+    figures(results, pose_tables(results, arguments.per_sequence))
+    if arguments.output is not None:
+        next_step(f"`improvo report {arguments.output}` makes a page of it")
     return 0
 
 
@@ -118,13 +121,13 @@ def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     from improvo.cli.evaluate_options import exported_features, loaded_frontends
     from improvo.evaluation.pose.results import results, write_records
     from improvo.evaluation.pose.run import run_pose_protocol
-    from improvo.files import make_output_folder, write_json
+    from improvo.files import check_output_folder, make_output_folder, write_json
     from improvo.jobs.pool import Workers
 
     settings, sources = _settings(arguments)
     output: Path | None = arguments.output
     if output is not None:
-        make_output_folder(output, COMMAND)
+        check_output_folder(output, COMMAND)
     default: list[str] | None = [] if arguments.features else None
     loaded, skipped = loaded_frontends(arguments.frontend, settings.max_keypoints, default)
     exported = exported_features(arguments.features, settings.max_keypoints, one_sequence=len(sources) == 1)
@@ -134,6 +137,8 @@ def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         earlier = read_results(output / "pose.json")
         if earlier.get("request") == json.loads(json.dumps(request)):
             return earlier
+    if output is not None:
+        make_output_folder(output, COMMAND)
     with (
         tempfile.TemporaryDirectory(prefix="improvo-") as temporary,
         Workers(arguments.workers, progress=True) as workers,
@@ -219,5 +224,5 @@ def _export(arguments: argparse.Namespace) -> int:
             with written_atomically(folder / f"{frame.source_index:06d}.png") as temporary:
                 cv2.imwrite(str(temporary), frame.image)
             written += 1
-    print(f"{written} images in {arguments.export_images}; export features as SEQUENCE/NUMBER.npz beside or elsewhere")
+    say(f"{written} images in {arguments.export_images}; export features as SEQUENCE/NUMBER.npz beside or elsewhere")
     return 0

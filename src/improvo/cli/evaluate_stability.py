@@ -9,6 +9,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from improvo.cli.output import figures, next_step
+
 COMMAND = "evaluate stability"
 
 
@@ -56,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
         "subjects": [{"name": name, **summarise(points)} for name, points in scored.items()],
     }
     text = stability_table(results)
-    print(text)
+    figures(results, text)
     if arguments.output is not None:
         from improvo.evaluation.stability.plot import draw_stability
 
@@ -64,4 +66,5 @@ def run(arguments: argparse.Namespace) -> int:
         write_json(arguments.output / "stability.json", results)
         write_text(arguments.output / "stability.md", text)
         draw_stability(scored, results, arguments.output / "stability.png")
+        next_step(f"`improvo report {arguments.output}` makes a page of it")
     return 0

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.output import figures, next_step
 from improvo.errors import InputError
 from improvo.evaluation.settings import ALIGNMENTS, TrajectoryCommandSettings, TrajectorySettings
 from improvo.sequences.base import SequenceSettings
@@ -78,12 +79,12 @@ def run(arguments: argparse.Namespace) -> int | None:
     from improvo.config import to_dict
     from improvo.evaluation.trajectory.protocol import evaluate_trajectory
     from improvo.evaluation.trajectory.tables import trajectory_tables
-    from improvo.files import make_output_folder, write_json, write_text
+    from improvo.files import check_output_folder, make_output_folder, write_json, write_text
 
     command = settings_from(TrajectoryCommandSettings, arguments, TRAJECTORY_FLAGS)
     settings = command.trajectory
     if arguments.output is not None:
-        make_output_folder(arguments.output, COMMAND)
+        check_output_folder(arguments.output, COMMAND)
     estimate, truth, notes = read_pair(arguments.estimate, arguments.against, command.sequence, arguments.truth)
     errors = evaluate_trajectory(estimate, truth, settings, (str(arguments.estimate), str(arguments.against)))
     result = {
@@ -95,10 +96,12 @@ def run(arguments: argparse.Namespace) -> int | None:
         "notes": list(notes),
     }
     text = trajectory_tables(result, arguments.estimate.name)
-    print(text + "".join(f"\n{note}" for note in notes), end="\n" if notes else "")
+    figures(result, text + "".join(f"\n{note}" for note in notes))
     if arguments.output is not None:
+        make_output_folder(arguments.output, COMMAND)
         write_json(arguments.output / "trajectory.json", result)
         write_text(arguments.output / "trajectory.md", text)
+        next_step(f"`improvo report {arguments.output}` makes a page of it")
     return 0
 
 

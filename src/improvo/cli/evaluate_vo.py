@@ -15,13 +15,14 @@ from improvo.cli.evaluate_options import (
 )
 from improvo.cli.evaluate_trajectory import TRAJECTORY_FLAGS, add_trajectory_arguments
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.output import figures, next_step
 from improvo.evaluation.settings import VoCommandSettings
 
 COMMAND = "evaluate vo"
 _FLAGS = {
     **TRAJECTORY_FLAGS,
     "max_keypoints": "max_keypoints",
-    "initialisation": "odometry.mode",
+    "mode": "odometry.mode",
     "seed": "odometry.seed",
 }
 
@@ -33,14 +34,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_truth_argument(parser)
     add_frontend_arguments(parser, defaults.max_keypoints)
     parser.add_argument(
-        "--initialisation",
+        "--mode",
         choices=("robust", "paper"),
         default=argparse.SUPPRESS,
         help=f"of the odometry (default: {defaults.odometry.mode})",
     )
     add_trajectory_arguments(parser)
     add_run_arguments(parser)
-    add_sequence_arguments(parser)
+    add_sequence_arguments(parser, defaults.sequence)
     add_config_arguments(parser)
 
 
@@ -51,14 +52,14 @@ def run(arguments: argparse.Namespace) -> int | None:
     from improvo.config import to_dict
     from improvo.evaluation.trajectory.tables import vo_tables
     from improvo.evaluation.vo.protocol import evaluate_vo
-    from improvo.files import make_output_folder, write_json, write_text
+    from improvo.files import check_output_folder, make_output_folder, write_json, write_text
     from improvo.geometry.trajectory_files import write_trajectory
     from improvo.jobs.pool import Workers
 
     settings = settings_from(VoCommandSettings, arguments, _FLAGS)
     output: Path | None = arguments.output
     if output is not None:
-        make_output_folder(output, COMMAND)
+        check_output_folder(output, COMMAND)
     frontends, _ = loaded_frontends(arguments.frontend, settings.max_keypoints, ["superpoint-vo"])
     sources = recorded_sequences(arguments, settings.sequence)
     with Workers(arguments.workers, progress=True) as workers:
@@ -72,12 +73,14 @@ def run(arguments: argparse.Namespace) -> int | None:
         )
     results = {"protocol": "vo", "improvo": __version__, "settings": to_dict(settings), **found}
     text = vo_tables(results)
-    print(text, end="")
+    figures(results, text)
     if output is not None:
+        make_output_folder(output, COMMAND)
         for outcome in outcomes:
             folder = output / f"{outcome.frontend}{outcome.variant}"
             folder.mkdir(exist_ok=True)
             write_trajectory(folder / f"{outcome.sequence}.txt", outcome.trajectory)
         write_json(output / "vo.json", results)
         write_text(output / "vo.md", text)
+        next_step(f"`improvo report {arguments.output}` makes a page of it")
     return 0

@@ -1,31 +1,137 @@
-"""`improvo export TARGET`: what other tools read. Each target is a module with `add_arguments(parser)` and `run`."""
+"""`improvo export colmap`, `nerfstudio`, `trajectory`, `onnx`: finished runs and networks for other tools."""
 
 from __future__ import annotations
 
 import argparse
-import importlib
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-# target -> (module under improvo.cli, help line)
-TARGETS: dict[str, tuple[str, str]] = {
-    "onnx": ("export_onnx", "a network with its decoding, for ONNX Runtime"),
-    "colmap": ("export_colmap", "a finished run as COLMAP's sparse model, with images"),
-    "nerfstudio": ("export_nerfstudio", "a finished run as Nerfstudio's transforms.json, with images"),
-    "trajectory": ("export_trajectory", "the poses of a finished run as TUM, KITTI or EuRoC file"),
-}
+from improvo.cli.flags import add_setting
+from improvo.cli.output import next_step, say
+from improvo.cli.show_options import add_recording, add_run_folder, target_path
+from improvo.errors import OutputError
+
+if TYPE_CHECKING:
+    from improvo.export.model import Model
+    from improvo.odometry.run_folder import RunFolder
+    from improvo.types import UInt8
+
+_ONNX_SETTINGS = ("max_keypoints", "threshold", "nms_radius", "border", "subpixel_radius")
+_FILE_NAMES = {"tum": "trajectory.txt", "kitti": "poses.txt", "euroc": "data.csv"}
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The targets and their options."""
-    targets = parser.add_subparsers(dest="target", metavar="TARGET", required=True)
-    for name, (module_name, help_line) in TARGETS.items():
-        target = targets.add_parser(
-            name, help=help_line, description=help_line, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+def add_colmap_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `improvo export colmap`."""
+    _add_model_arguments(parser, "sparse/0, sparse/1, ... (one per segment) and images")
+    parser.add_argument("--no-images", action="store_true", help="write only the model, not the frames")
+
+
+def run_colmap(arguments: argparse.Namespace) -> None:
+    """Write the model of every segment, the longest first."""
+    from improvo.export.colmap import write_colmap
+    from improvo.export.model import segment_model, segments_by_length
+    from improvo.files import make_output_folder
+    from improvo.odometry.run_folder import RunFolder
+
+    run_folder = RunFolder(arguments.folder, arguments.sequence)
+    segments = segments_by_length(run_folder)
+    models = [segment_model(run_folder, each, arguments.max_error, arguments.min_observations) for each in segments]
+    make_output_folder(arguments.output, "export colmap")
+    for number, model in enumerate(models):
+        colours = None if arguments.no_images else _write_images(run_folder, model, arguments.output / "images")
+        target = arguments.output / "sparse" / str(number)
+        write_colmap(model, run_folder.camera, target, colours)
+        say(
+            f"{target}: {len(model.frames)} images, {len(model.xyz)} points, {len(model.error)} observations, "
+            f"mean re-projection error {model.mean_error:.6f} px"
         )
-        module = importlib.import_module(f"improvo.cli.{module_name}")
-        module.add_arguments(target)
-        target.set_defaults(target_function=module.run)
+    next_step(f"open {arguments.output / 'sparse' / '0'} with COLMAP, pycolmap or what reads their model")
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Export to the chosen target."""
-    arguments.target_function(arguments)
+def add_nerfstudio_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `improvo export nerfstudio`."""
+    _add_model_arguments(parser, "transforms.json, images and a point cloud")
+
+
+def run_nerfstudio(arguments: argparse.Namespace) -> None:
+    """Write the longest segment; one scene has one world."""
+    from improvo.export.model import segment_model, segments_by_length
+    from improvo.export.nerfstudio import write_nerfstudio
+    from improvo.files import make_output_folder
+    from improvo.odometry.run_folder import RunFolder
+
+    run_folder = RunFolder(arguments.folder, arguments.sequence)
+    segments = segments_by_length(run_folder)
+    model = segment_model(run_folder, segments[0], arguments.max_error, arguments.min_observations)
+    make_output_folder(arguments.output, "export nerfstudio")
+    colours = _write_images(run_folder, model, arguments.output / "images")
+    write_nerfstudio(model, run_folder.camera, arguments.output, colours)
+    say(f"{arguments.output / 'transforms.json'}: {len(model.frames)} images, {len(model.xyz)} points")
+    if len(segments) > 1:
+        left = run_folder.frames - len(model.frames)
+        say(f"  only the longest of {len(segments)} segments: {left} frames have no pose in its world")
+    next_step(f"`ns-train splatfacto --data {arguments.output}`, with Nerfstudio installed")
+
+
+def add_trajectory_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `improvo export trajectory`."""
+    add_run_folder(parser)
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to write")
+    parser.add_argument("--format", choices=tuple(_FILE_NAMES), default="tum", help="of the file")
+
+
+def run_trajectory(arguments: argparse.Namespace) -> None:
+    """Write the poses that there are."""
+    from improvo.export.trajectory import export_trajectory
+    from improvo.odometry.run_folder import RunFolder
+
+    run_folder = RunFolder(arguments.folder)
+    target = target_path(arguments.output, arguments.output, _FILE_NAMES[arguments.format])
+    export_trajectory(run_folder.trajectory, run_folder.frames, target, arguments.format)
+    say(f"{target}: {len(run_folder.trajectory)} poses, camera-to-world, in map units")
+    next_step(f"`improvo evaluate trajectory {target} TRUTH` measures them")
+
+
+def add_onnx_arguments(parser: argparse.ArgumentParser) -> None:
+    """Weights, output, and the settings of decoding, which are fixed in the file."""
+    from improvo.frontend.settings import NetworkSettings
+
+    defaults = NetworkSettings()
+    parser.add_argument("weights", metavar="WEIGHTS", help="a bundled name or a weights file")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="ONNX file to write")
+    for name in _ONNX_SETTINGS:
+        add_setting(parser, defaults, f"--{name.replace('_', '-')}", name)
+
+
+def run_onnx(arguments: argparse.Namespace) -> None:
+    """A network with its decoding as one ONNX file: image in, keypoints, descriptors and stability out."""
+    from improvo.export.onnx import export_onnx
+    from improvo.frontend.settings import NetworkSettings
+    from improvo.frontend.weights import find_weights, load_weights
+
+    given = {name: getattr(arguments, name) for name in _ONNX_SETTINGS if hasattr(arguments, name)}
+    # the move to corners works on the image beside the network, and is no part of the file
+    settings = NetworkSettings(**given, corner_radius=0)
+    if not arguments.output.parent.is_dir():
+        raise OutputError(f"{arguments.output}: no folder {arguments.output.parent}; make it first")
+    export_onnx(load_weights(find_weights(arguments.weights)), arguments.output, settings)
+    say(f"{arguments.output}: image (batch, 1, height, width) in [0, 1] -> {settings.max_keypoints} keypoints")
+    say("without the move to the image's corners (`improvo.frontend.corners`), which `improvo run` makes afterwards")
+    next_step("load it with ONNX Runtime or any other runtime")
+
+
+def _add_model_arguments(parser: argparse.ArgumentParser, contents: str) -> None:
+    """What the exports of maps have in common."""
+    add_run_folder(parser)
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER", help=f"new folder for {contents}")
+    parser.add_argument("--max-error", type=float, default=4.0, metavar="PIXELS", help="drop observations beyond this")
+    parser.add_argument("--min-observations", type=int, default=3, metavar="N", help="drop points with fewer")
+    add_recording(parser)
+
+
+def _write_images(run_folder: RunFolder, model: Model, folder: Path) -> UInt8:
+    from improvo.export.model import write_images
+    from improvo.terminal import progress
+
+    with progress("images", "frame", len(model.frames)) as shown:
+        return write_images(run_folder, model, folder, shown.advance)

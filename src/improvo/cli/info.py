@@ -1,49 +1,40 @@
-"""`improvo info SEQUENCE`."""
+"""What a recording was recognised as: frames, camera, depth, truth; and what is wrong with it, with advice."""
 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
+from improvo.cli.flags import add_setting
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.output import figures, next_step
 from improvo.sequences.settings import InfoSettings
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `improvo info`."""
     parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a video, an image folder, a data set or a bag")
-    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
-    parser.add_argument(
-        "--samples",
-        type=int,
-        default=argparse.SUPPRESS,
-        metavar="N",
-        help=f"pairs of frames to look at (default: {InfoSettings().samples})",
-    )
+    add_setting(parser, InfoSettings(), "--samples", "samples", help="pairs of frames to look at")
     add_sequence_arguments(parser)
     add_config_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Look at the recording and print what was found."""
-    from tqdm import tqdm
-
     from improvo.sequences.survey import survey
+    from improvo.terminal import progress
 
-    settings = settings_from(InfoSettings, arguments, {"samples": "samples"})
-    with tqdm(unit="pair", desc="info", delay=1.0, leave=False) as bar:
-        findings = survey(arguments.sequence, settings.sequence, max(1, settings.samples), bar.update).to_dict()
-    if arguments.json:
-        print(json.dumps(findings, indent=2))
-        return
-    for name, text in _lines(findings):
-        print(f"{name:<14} {text}")
-    for problem in findings["problems"]:
-        print(f"! {problem['what']}\n  -> {problem['advice']}")
+    settings = settings_from(InfoSettings, arguments)
+    with progress("info", "pair") as shown:
+        findings = survey(arguments.sequence, settings.sequence, max(1, settings.samples), shown.advance).to_dict()
+    lines = [f"{name:<14} {text}" for name, text in _lines(findings)]
+    lines += [f"! {problem['what']}\n  -> {problem['advice']}" for problem in findings["problems"]]
     if not findings["problems"]:
-        print("nothing wrong was found")
+        lines.append("nothing wrong was found")
+    figures(findings, "\n".join(lines))
+    camera = "" if findings["camera"] else " --camera FILE"
+    next_step(f"`improvo run {arguments.sequence}{camera} -o out`")
 
 
 def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:

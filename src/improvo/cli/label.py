@@ -1,19 +1,28 @@
-"""`improvo label SEQUENCE... -o LABELS`."""
+"""Stability labels for many sequences: odometry on each, then the paper's rule on its tracks.
+
+Run again to continue: what is labelled is skipped. One folder per sequence and manifest.parquet are left in LABELS.
+"""
 
 from __future__ import annotations
 
 import argparse
-import sys
+from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from improvo.cli.flags import add_setting
 from improvo.cli.options import (
-    FRONTEND_FLAGS,
     add_config_arguments,
     add_frontend_arguments,
     add_sequence_arguments,
+    check_recordings,
     settings_from,
 )
+from improvo.cli.output import figures, next_step, notice, say
 from improvo.odometry.run_settings import LabelRunSettings
+
+if TYPE_CHECKING:
+    from improvo.labeling.store import SequenceRecord
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,59 +32,59 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "sequences", type=Path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
     )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="LABELS", help="folder of the label store")
-    parser.add_argument(
-        "--workers",
-        type=int,
-        metavar="N",
-        help="sequences at a time, a process for each (default: 1; with --ray, the cluster's cores)",
-    )
-    parser.add_argument(
-        "--ray",
-        metavar="ADDRESS",
-        help="do the work on a Ray cluster (host:port, `auto`, or `local`) whose nodes share these folders",
-    )
+    add_job_arguments(parser)
     parser.add_argument("--pack", action="store_true", help="keep the frames beside the labels, to train elsewhere")
     parser.add_argument(
         "--relabel", action="store_true", help="where LABELS was made with other settings, label all of it anew"
     )
-    parser.add_argument(
-        "--max-stray",
-        type=float,
-        default=argparse.SUPPRESS,
+    add_setting(
+        parser,
+        defaults,
+        "--flow-outlier-limit",
+        "odometry.matching.flow_outlier_limit",
         metavar="SHARE",
         help="end tracks where a link is farther than this share of the image width from the frame's median motion; "
         "0.1 suits video of 10 frames a second and more (default: 0, never, as in the paper)",
     )
-    add_frontend_arguments(parser, defaults.frontend.name, defaults.frontend.max_keypoints)
+    add_frontend_arguments(parser, defaults)
     add_sequence_arguments(parser)
     add_config_arguments(parser)
 
 
+def add_job_arguments(parser: argparse.ArgumentParser) -> None:
+    """Who does the work on many sequences."""
+    parser.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="sequences labelled at a time, a process for each (default: 1; with --ray, the cluster's cores)",
+    )
+    parser.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="label on a Ray cluster (host:port, `auto`, or `local`) whose nodes share these folders",
+    )
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Label what is not labelled yet; 0 unless nothing could be."""
-    settings = settings_from(
-        LabelRunSettings, arguments, FRONTEND_FLAGS | {"max_stray": "odometry.matching.flow_outlier_limit"}
-    )
-    from tqdm import tqdm
-
+    settings = settings_from(LabelRunSettings, arguments)
+    check_recordings(arguments.sequences)
     from improvo.labeling.label_sequences import label_sequences
-    from improvo.labeling.store import DONE, SequenceRecord
+    from improvo.labeling.store import DONE
     from improvo.odometry.compile import compile_odometry
+    from improvo.terminal import progress
 
-    compile_odometry(lambda words: print(words, file=sys.stderr))
+    compile_odometry(notice)
     total = len(arguments.sequences)
     finished = 0
-    with tqdm(unit="frame", desc=f"label 0/{total}", smoothing=0.1, delay=0.5) as bar:
+    with progress(f"label 0/{total}", "frame") as shown:
 
         def on_record(record: SequenceRecord) -> None:
             nonlocal finished
             finished += 1
-            bar.set_description(f"label {finished}/{total}")
-            with tqdm.external_write_mode():
-                print(_line(record))
-
-        def on_frames(count: int) -> None:
-            bar.update(count)
+            shown.describe(f"label {finished}/{total}")
+            say(_line(record))
 
         records = label_sequences(
             arguments.sequences,
@@ -86,19 +95,23 @@ def run(arguments: argparse.Namespace) -> int:
             relabel=arguments.relabel,
             ray=arguments.ray,
             on_record=on_record,
-            on_frames=on_frames,
+            on_frames=shown.advance,
         )
     done = [record for record in records if record.state == DONE]
     stable, unstable = sum(r.stable for r in done), sum(r.unstable for r in done)
-    print(f"{len(done)} of {len(records)} sequences labelled: {stable} stable and {unstable} unstable tracks")
-    print(f"labels in {arguments.output}")
+    figures([asdict(record) for record in records], "")
+    say(f"{len(done)} of {len(records)} sequences labelled: {stable} stable and {unstable} unstable tracks")
+    say(f"labels in {arguments.output}")
+    next_step(
+        f"`improvo report {arguments.output}` makes a page of it, "
+        f"`improvo train odometry {arguments.output} -o network` learns from it"
+    )
     return 0
 
 
-def _line(record: object) -> str:
-    from improvo.labeling.store import DONE, SequenceRecord
+def _line(record: SequenceRecord) -> str:
+    from improvo.labeling.store import DONE
 
-    assert isinstance(record, SequenceRecord)
     if record.state != DONE:
         return f"{record.name}: not labelled: {record.reason}"
     poses = f"{record.tracked} of {record.frames} frames with a pose"

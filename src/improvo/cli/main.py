@@ -1,37 +1,21 @@
-"""`improvo VERB ...`: finds the command's module, runs it, and turns errors into one line and exit status 2."""
+"""`improvo VERB ...`: finds the command in the table, runs it, and turns errors into one line and exit status 2."""
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import os
 import sys
 from collections.abc import Sequence
-from types import ModuleType
 
 from improvo import __version__
+from improvo.cli import output
+from improvo.cli.commands import COMMANDS, Command
 from improvo.errors import ImprovoError
+from improvo.jobs.interrupts import termination_interrupts
 
-# verb -> (module under improvo.cli, help line). A module has `add_arguments(parser)` and `run(arguments)`, which
-# returns int or None; a verb with its own sub-commands adds them with `parser.add_subparsers`. Heavy imports belong
-# inside `run`.
-COMMANDS: dict[str, tuple[str, str]] = {
-    "label": ("label", "stability labels for many sequences: odometry, then the paper's rule"),
-    "improve": ("improve", "the main job: label video, train the frontend with the labels, keep it if it got better"),
-    "run": ("run", "visual odometry on one sequence: trajectory, map, tracks"),
-    "evaluate": ("evaluate", "how good a frontend or a trajectory is: the paper's protocols"),
-    "truth": ("truth", "reference poses and camera of a recording by structure from motion"),
-    "train": ("train", "teach the network: drawn shapes, homographies"),
-    "show": ("show", "the pictures of the paper, from a run, a recording or an evaluation"),
-    "report": ("report", "one HTML page about a run, labels or an evaluation"),
-    "weights": ("weights", "import public weights, prepare weights for int8, print a model card"),
-    "export": ("export", "what other tools read: COLMAP, Nerfstudio, trajectories, ONNX"),
-    "simulate": ("simulate", "render rooms with exact depth, poses and causes of instability"),
-    "info": ("info", "what a recording was recognised as, and what is wrong with it"),
-    "calibrate": ("calibrate", "a camera from a recording of a board, and the board to print"),
-    "demo": ("demo", "the main job on a small bundled recording, in minutes"),
-    "config": ("config", "print all settings of a command as YAML"),
-}
+_EPILOG = """\
+`improvo VERB --help` shows a command's options with their defaults.
+Exit status: 0 done, 2 an error that you can mend (one line says how), 130 interrupted, 1 a bug of improvo."""
 
 
 class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
@@ -43,13 +27,17 @@ class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
         return super()._get_help_string(action)
 
 
+class _Text(HelpFormatter, argparse.RawDescriptionHelpFormatter):
+    """Keeps the line breaks of descriptions."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point. Returns the exit status: 0 done, 2 an error that the user can mend, 130 interrupted."""
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        verb = next((word for word in words if not word.startswith("-")), None)
-        arguments = _parser(verb).parse_args(words)
-        return int(arguments.module.run(arguments) or 0)
+        arguments = parser_for(words).parse_args(words)
+        with output.configured(arguments.quiet, getattr(arguments, "json", False)), termination_interrupts():
+            return int(arguments.run_command(arguments) or 0)
     except ImprovoError as error:
         print(f"improvo: {error}", file=sys.stderr)
         return 2
@@ -61,22 +49,42 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
 
 
-def _parser(verb: str | None) -> argparse.ArgumentParser:
-    """The parser of all verbs; only the chosen one's module is imported."""
+def parser_for(words: Sequence[str]) -> argparse.ArgumentParser:
+    """The parser of all commands; only the module of the one that `words` name is imported."""
     parser = argparse.ArgumentParser(
         prog="improvo",
         description="Self-improving visual odometry: video in; a trajectory, a map and a better frontend out.",
-        epilog="`improvo VERB --help` shows a command's options with their defaults.",
+        epilog=_EPILOG,
+        formatter_class=_Text,
     )
     parser.add_argument("--version", action="version", version=f"improvo {__version__}")
+    named = [word for word in words if not word.startswith("-")][:2]
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
-    for name, (module_name, help_line) in COMMANDS.items():
-        verb_parser = verbs.add_parser(name, help=help_line, description=help_line, formatter_class=HelpFormatter)
-        if name == verb:
-            module: ModuleType = importlib.import_module(f"improvo.cli.{module_name}")
-            module.add_arguments(verb_parser)
-            verb_parser.set_defaults(module=module)
+    _add_commands(verbs, COMMANDS, named)
     return parser
+
+
+def _add_commands(
+    parsers: argparse._SubParsersAction[argparse.ArgumentParser], commands: dict[str, Command], named: list[str]
+) -> None:
+    for name, command in commands.items():
+        chosen = named[:1] == [name]
+        leaf = chosen and not command.parts
+        description = command.description() if leaf else command.help
+        parser = parsers.add_parser(name, help=command.help, description=description, formatter_class=_Text)
+        if command.parts:
+            parts = parser.add_subparsers(dest="part", metavar=command.part_name, required=True)
+            _add_commands(parts, dict(command.parts), named[1:] if chosen else [])
+        elif leaf:
+            from improvo.cli.options import add_preset_argument
+
+            add_arguments, run = command.functions()
+            add_arguments(parser)
+            add_preset_argument(parser, command.settings.partition(":")[2])
+            if command.figures:
+                parser.add_argument("--json", action="store_true", help="print the figures as JSON, and nothing else")
+            parser.add_argument("--quiet", action="store_true", help="print results and errors only")
+            parser.set_defaults(run_command=run)
 
 
 if __name__ == "__main__":

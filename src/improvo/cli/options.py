@@ -1,4 +1,4 @@
-"""Options that many commands share: how sequences are read, --config and --set."""
+"""Options that many commands share: how sequences are read, the frontend, --config, --set and --preset."""
 
 from __future__ import annotations
 
@@ -7,60 +7,56 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-
 from improvo import config
+from improvo.cli.flags import add_setting
+from improvo.errors import InputError
+from improvo.presets import preset, presets
+from improvo.sequences.base import SequenceSettings
 
 T = TypeVar("T")
 
-_SEQUENCE_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("format", {"help": "of the sequence (default: guessed)"}),
-    ("camera", {"metavar": "FILE", "help": "a calibration file, or fx,fy,cx,cy[,k1,k2,p1,p2,k3]"}),
-    ("fov", {"type": float, "metavar": "DEGREES", "help": "horizontal field of view, where nothing better is known"}),
-    ("fps", {"type": float, "help": "frame rate of recordings without time stamps"}),
-    ("start", {"type": int, "metavar": "N", "help": "first frame (default: 0)"}),
-    ("end", {"type": int, "metavar": "N", "help": "one past the last frame (default: all)"}),
-    ("stride", {"type": int, "metavar": "N", "help": "every n-th frame (default: 1)"}),
-    ("max-frames", {"type": int, "metavar": "N", "help": "at most so many, after the stride (default: all)"}),
-    (
-        "undistorted-fov",
-        {
-            "type": float,
-            "metavar": "DEGREES",
-            "help": "how much of a distorted wide lens is seen (default: all up to 120, beyond that what keeps the "
-            "resolution in the middle)",
-        },
-    ),
-    ("width", {"type": int, "metavar": "PIXELS", "help": "resize to this width (default: as recorded)"}),
-    ("topic", {"metavar": "NAME", "help": "image topic of a ROS bag, or camera of a recording with several"}),
-)
-
-FRONTEND_FLAGS = {"frontend": "frontend.name", "max_keypoints": "frontend.max_keypoints", "seed": "odometry.seed"}
+_SEQUENCE_OPTIONS: dict[str, dict[str, Any]] = {
+    "format": {"help": "of the sequence (default: guessed)"},
+    "camera": {"metavar": "FILE"},
+    "fov": {"metavar": "DEGREES"},
+    "fps": {},
+    "start": {},
+    "end": {"help": "one past the last frame of the recording (default: all)"},
+    "stride": {},
+    "max_frames": {"help": "at most so many, after the stride (default: all)"},
+    "undistorted_fov": {
+        "metavar": "DEGREES",
+        "help": "how much of a distorted wide lens is seen (default: all up to 120, beyond that what keeps the "
+        "resolution in the middle)",
+    },
+    "width": {"metavar": "PIXELS", "help": "resize to this width (default: as recorded)"},
+    "topic": {"metavar": "NAME"},
+}
 
 
-def add_sequence_arguments(parser: argparse.ArgumentParser) -> None:
+def add_sequence_arguments(parser: argparse.ArgumentParser, defaults: SequenceSettings | None = None) -> None:
     """How the sequence is read; read back by `settings_from`."""
     group = parser.add_argument_group("how the sequence is read")
-    for name, options in _SEQUENCE_OPTIONS:
-        group.add_argument(f"--{name}", default=argparse.SUPPRESS, **options)
+    defaults = defaults or SequenceSettings()
+    for name, options in _SEQUENCE_OPTIONS.items():
+        add_setting(group, defaults, f"--{name.replace('_', '-')}", name, section="sequence.", **options)
 
 
-def add_frontend_arguments(parser: argparse.ArgumentParser, name: str, max_keypoints: int) -> None:
-    """Which frontend, how many keypoints, and the seed; the defaults are only shown. Read back with FRONTEND_FLAGS."""
-    parser.add_argument(
-        "--frontend",
-        default=argparse.SUPPRESS,
-        metavar="NAME",
-        help=f"sift, orb, akaze, surf, a bundled network or a .safetensors file (default: {name})",
+def add_frontend_arguments(parser: argparse.ArgumentParser, defaults: Any) -> None:
+    """Which frontend, how many keypoints, how a network runs, and the seed.
+
+    Args:
+        defaults: settings with the sections `frontend` and `odometry`.
+    """
+    add_setting(parser, defaults, "--frontend", "frontend.name", metavar="NAME")
+    add_setting(parser, defaults, "--max-keypoints", "frontend.max_keypoints")
+    network = "frontend.network"
+    add_setting(
+        parser, defaults, "--threshold", f"{network}.threshold", help="least probability of a network's keypoint"
     )
-    parser.add_argument(
-        "--max-keypoints",
-        type=int,
-        default=argparse.SUPPRESS,
-        metavar="N",
-        help=f"per frame (default: {max_keypoints})",
-    )
-    parser.add_argument("--seed", type=int, default=argparse.SUPPRESS, help="of all random choices (default: 0)")
+    add_setting(parser, defaults, "--device", f"{network}.device", help="of a network; cuda needs the extra `train`")
+    add_setting(parser, defaults, "--precision", f"{network}.precision", help="of a network")
+    add_setting(parser, defaults, "--seed", "odometry.seed", help="of all random choices")
 
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,24 +72,51 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def check_recordings(paths: list[Path]) -> None:
+    """Refuse a list of recordings of which none is there; where only some are missing, the rest is worked on.
+
+    Raises:
+        InputError: none is there.
+    """
+    from improvo.sequences.live import is_live
+
+    if not any(path.exists() or is_live(str(path)) for path in paths):
+        raise InputError(f"{paths[0]}: no such file or folder; check the path")
+
+
+def add_preset_argument(parser: argparse.ArgumentParser, class_name: str) -> None:
+    """`--preset NAME`, where the command's settings have presets."""
+    names = list(presets(class_name))
+    if names:
+        what = "everything that the paper fixes" if names == ["paper"] else "whole settings by name"
+        parser.add_argument(
+            "--preset", choices=names, help=f"{what}; --config, --set and flags change it (`improvo config` prints it)"
+        )
+
+
 def settings_from(
-    cls: type[T], arguments: argparse.Namespace, flags: Mapping[str, str], extra: list[str] | None = None
+    cls: type[T],
+    arguments: argparse.Namespace,
+    flags: Mapping[str, str] | None = None,
+    extra: list[str] | None = None,
 ) -> T:
-    """Settings from --config, then --set, then the command's own flags.
+    """Settings from --preset, then --config, then --set, then the command's own flags.
 
     Args:
-        flags: the name of an argument and the setting that it stands for; absent arguments change nothing.
+        flags: further arguments, and the settings that they stand for; absent arguments change nothing.
         extra: further `name=value` settings, applied last.
 
     Raises:
         ConfigError: an unknown setting or a value of the wrong type.
     """
-    names = {name.replace("-", "_"): f"sequence.{name.replace('-', '_')}" for name, _ in _SEQUENCE_OPTIONS} | dict(
-        flags
-    )
+    import yaml
+
+    names = {**getattr(arguments, "flags", {}), **(flags or {})}
     given = [
         f"{setting}={yaml.safe_dump(getattr(arguments, name), default_flow_style=True).splitlines()[0]}"
         for name, setting in names.items()
         if hasattr(arguments, name)
     ]
-    return config.load(cls, arguments.config, [*arguments.set, *given, *(extra or [])])
+    name = getattr(arguments, "preset", None)
+    base = preset(cls, name) if name else None
+    return config.load(cls, arguments.config, [*arguments.set, *given, *(extra or [])], base)

@@ -1,28 +1,26 @@
-"""`improvo run SEQUENCE -o OUT`."""
+"""Visual odometry on one sequence.
+
+Leaves trajectory.txt, map.ply, tracks.parquet, points.parquet and run.json in OUT. Poses and map are up to scale.
+"""
 
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from improvo.cli.options import (
-    FRONTEND_FLAGS,
-    add_config_arguments,
-    add_frontend_arguments,
-    add_sequence_arguments,
-    settings_from,
-)
+from improvo.cli.flags import add_setting
+from improvo.cli.options import add_config_arguments, add_frontend_arguments, add_sequence_arguments, settings_from
+from improvo.cli.output import figures, next_step, notice, say
 from improvo.depth.run_settings import DenseRunSettings
 
 if TYPE_CHECKING:
-    from improvo.odometry.run import RunSummary
+    from improvo.labeling.labeler import LabeledRun
     from improvo.odometry.visual_odometry import TrackedFrame
     from improvo.odometry.visualizer import Visualizer
     from improvo.sequences import Sequence
 
-_FLAGS = {**FRONTEND_FLAGS, "initialisation": "odometry.mode"}
+_WARNINGS = 5  # printed; run.json has them all
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,13 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     defaults = DenseRunSettings()
     parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a video, an image folder or a data set")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
-    add_frontend_arguments(parser, defaults.frontend.name, defaults.frontend.max_keypoints)
-    parser.add_argument(
-        "--initialisation",
-        choices=("robust", "paper"),
-        default=argparse.SUPPRESS,
-        help="robust, or the paper's: previous pose, unit depth, nothing else (default: robust)",
-    )
+    add_frontend_arguments(parser, defaults)
+    add_setting(parser, defaults, "--mode", "odometry.mode", choices=("robust", "paper"))
     parser.add_argument(
         "--no-stability", action="store_true", help="weigh all observations alike (default: by stability)"
     )
@@ -56,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Track the sequence and write the results; 130 after an interrupt."""
     extra = ["frontend.use_stability=false"] if arguments.no_stability else []
     extra += ["dense=true"] if arguments.dense else []
-    settings = settings_from(DenseRunSettings, arguments, _FLAGS, extra=extra)
+    settings = settings_from(DenseRunSettings, arguments, extra=extra)
     from improvo.files import check_output_folder
     from improvo.sequences import open_sequence
 
@@ -68,13 +61,14 @@ def run(arguments: argparse.Namespace) -> int:
         refuse_live(sequence)
     camera = sequence.camera
     frames = "live, Ctrl-C ends it: frames" if sequence.length is None else f"{sequence.length} frames"
-    print(
+    say(
         f"{sequence.name}: {sequence.format}, {frames} of {camera.width}x{camera.height}; "
         f"frontend {settings.frontend.name}; poses and map are up to scale"
     )
     for note in sequence.notes:
-        print(f"note: {note}")
+        say(f"note: {note}")
     summary = _track(sequence, arguments.output, settings, _viewer(arguments))
+    figures(_figures(summary), "")
     _print_summary(summary)
     interrupted = bool(summary.report["interrupted"])
     if settings.dense and not interrupted:
@@ -83,7 +77,13 @@ def run(arguments: argparse.Namespace) -> int:
         from improvo.report.pages import write_report
 
         write_report(arguments.output, arguments.output / "report.html")
-        print(f"page in {arguments.output / 'report.html'}")
+        say(f"page in {arguments.output / 'report.html'}")
+    elif summary.tracked:
+        next_step(
+            f"`improvo report {summary.folder}` makes a page of it, `improvo show map {summary.folder}` a picture"
+        )
+    else:
+        next_step(f"`improvo info {arguments.sequence}` looks for what is wrong with the recording")
     return 130 if interrupted else 0
 
 
@@ -96,63 +96,64 @@ def _viewer(arguments: argparse.Namespace) -> Visualizer | None:
     return RerunViewer(arguments.save)
 
 
-def _track(sequence: Sequence, folder: Path, settings: DenseRunSettings, viewer: Visualizer | None) -> RunSummary:
-    """The run with its progress line."""
-    from tqdm import tqdm
-
+def _track(sequence: Sequence, folder: Path, settings: DenseRunSettings, viewer: Visualizer | None) -> LabeledRun:
+    """The run with its progress."""
+    from improvo.labeling.labeler import run_and_label
     from improvo.odometry.compile import compile_odometry
-    from improvo.odometry.run import run_odometry
+    from improvo.terminal import progress
 
-    compile_odometry(lambda words: print(words, file=sys.stderr))
-    with tqdm(total=sequence.length, unit="frame", desc="run", smoothing=0.1, delay=0.5) as bar:
+    compile_odometry(notice)
+    with progress("run", "frame", sequence.length) as shown:
 
-        def progress(frame: TrackedFrame) -> None:
-            bar.set_postfix_str("no pose yet" if frame.cam_from_world is None else "", refresh=False)
-            bar.update()
+        def told(frame: TrackedFrame) -> None:
+            shown.note("no pose yet" if frame.cam_from_world is None else "")
+            shown.advance()
 
-        return run_odometry(sequence, folder, settings, visualizer=viewer, progress=progress)
+        return run_and_label(sequence, folder, settings, visualizer=viewer, progress=told)
 
 
-def _add_depth(sequence: Sequence, summary: RunSummary, settings: DenseRunSettings) -> bool:
-    """Depth maps and cloud with their progress line; whether they were interrupted."""
-    from tqdm import tqdm
-
+def _add_depth(sequence: Sequence, summary: LabeledRun, settings: DenseRunSettings) -> bool:
+    """Depth maps and cloud with their progress; whether they were interrupted."""
     from improvo.depth.compile import compile_depth
     from improvo.depth.dense import write_dense
+    from improvo.terminal import progress
 
-    compile_depth(lambda words: print(words, file=sys.stderr))
-    with tqdm(total=summary.tracked, unit="frame", desc="depth", smoothing=0.1, delay=0.5) as bar:
-        entry = write_dense(sequence, summary, settings.depth, bar.update)
-    print(
+    compile_depth(notice)
+    with progress("depth", "frame", summary.tracked) as shown:
+        entry = write_dense(sequence, summary, settings.depth, shown.advance)
+    say(
         f"depth of {entry['frames']} frames in depth.zip, {100 * entry['share']:.0f} % of their pixels; "
         f"{entry['points']} points in dense.ply"
     )
     return bool(entry["interrupted"])
 
 
-def _print_summary(summary: RunSummary) -> None:
+def _figures(summary: LabeledRun) -> dict[str, Any]:
+    report = summary.report
+    names = ("frames", "segments", "points", "tracks", "events", "interrupted", "seconds", "frames_per_second")
+    return {"folder": str(summary.folder), **{name: report[name] for name in names}}
+
+
+def _print_summary(summary: LabeledRun) -> None:
     from improvo.odometry.run_folder import why_no_pose
 
     report = summary.report
     frames, segments = report["frames"], report["segments"]
-    print(
+    say(
         f"{frames['tracked']} of {frames['processed']} frames have a pose, in {len(segments)} segment(s); "
         f"{report['points']} points; {report['frames_per_second']} frames/s"
     )
     for segment in segments[1:] if len(segments) > 1 else []:
-        print(f"  segment {segment['number']} starts at frame {segment['first']}: own scale, placed by guess")
+        say(f"  segment {segment['number']} starts at frame {segment['first']}: own scale, placed by guess")
     warnings = [event for event in report["events"] if event["kind"] in ("lost", "contradiction")]
-    for event in warnings[:5]:
-        print(f"  frame {event['frame_index']}: {event['kind']}: {event['detail']}")
-    if len(warnings) > 5:
-        print(f"  ... {len(warnings) - 5} more in run.json")
+    for event in warnings[:_WARNINGS]:
+        say(f"  frame {event['frame_index']}: {event['kind']}: {event['detail']}")
+    if len(warnings) > _WARNINGS:
+        say(f"  ... {len(warnings) - _WARNINGS} more in run.json")
     skipped = report["input"]["skipped"]
     if skipped:
-        print(f"  {len(skipped)} frame(s) could not be read, first {skipped[0]['source']}: {skipped[0]['reason']}")
+        say(f"  {len(skipped)} frame(s) could not be read, first {skipped[0]['source']}: {skipped[0]['reason']}")
     if report["interrupted"]:
-        print("  interrupted: the result ends there, and is complete up to there")
+        say("  interrupted: the result ends there, and is complete up to there")
     without = why_no_pose(report)
-    if without is not None:
-        print(f"{without}; details in {summary.folder / 'run.json'}")
-        return
-    print(f"results in {summary.folder}; `improvo show map {summary.folder}` draws them")
+    say(f"results in {summary.folder}" if without is None else f"{without}; details in {summary.folder / 'run.json'}")

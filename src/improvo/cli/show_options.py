@@ -1,4 +1,4 @@
-"""What the pictures of `improvo show` have in common: where they go, and which frames they take."""
+"""What the pictures of `improvo show` have in common: their options, where they go, and which frames they take."""
 
 from __future__ import annotations
 
@@ -7,18 +7,59 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from improvo.cli.output import say
 from improvo.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
     from improvo.odometry.run_folder import RunFolder
-    from improvo.sequences import Sequence
     from improvo.types import UInt8
 
+_EVENLY = "6"  # frames of a sheet
 _MANY = 20  # frames that deserve a progress bar
 _LARGEST_SHEET = 60  # frames; more become files of their own
 
 
-def chosen_positions(which: str, count: int) -> list[int]:
+def add_run_folder(parser: argparse.ArgumentParser, made_by: str = "run") -> None:
+    """The output folder that a picture is made of."""
+    parser.add_argument("folder", type=Path, metavar="OUT", help=f"output folder of `improvo {made_by}`")
+
+
+def add_recording(parser: argparse.ArgumentParser) -> None:
+    """Where the recording of a run is now."""
+    parser.add_argument(
+        "--sequence", type=Path, metavar="PATH", help="where the recording is now (default: where it was)"
+    )
+
+
+def add_target(parser: argparse.ArgumentParser, default: str) -> None:
+    """Where the picture goes."""
+    parser.add_argument(
+        "-o", "--output", "--save", type=Path, metavar="PATH", help=f"file or folder (default: {default})"
+    )
+
+
+def add_palette(parser: argparse.ArgumentParser) -> None:
+    """The colours."""
+    parser.add_argument("--palette", choices=("paper", "colour-blind"), default="paper", help="of the pictures")
+
+
+def add_frames(parser: argparse.ArgumentParser) -> None:
+    """Which frames, and whether as a sheet, files or a video."""
+    parser.add_argument(
+        "--frames", default=_EVENLY, metavar="WHICH", help="`all`, a list such as 10,50,90, or N for N spread evenly"
+    )
+    parser.add_argument("--each", action="store_true", help="one PNG per frame, not one sheet")
+    parser.add_argument("--video", action="store_true", help="one MP4 (of all frames, unless --frames says else)")
+    parser.add_argument("--video-fps", type=float, metavar="FPS", help="of the video (default: as recorded)")
+
+
+def asked_frames(arguments: argparse.Namespace, count: int) -> list[int]:
+    """The frames that the arguments of `add_frames` name, of `count`."""
+    which = "all" if arguments.video and arguments.frames == _EVENLY else arguments.frames
+    return chosen_frames(which, count)
+
+
+def chosen_frames(which: str, count: int) -> list[int]:
     """The frames that `--frames` names, of `count`.
 
     Raises:
@@ -44,7 +85,7 @@ def chosen_positions(which: str, count: int) -> list[int]:
 
 
 def target_path(output: Path | None, default_folder: Path, name: str) -> Path:
-    """Where a picture goes: `output` as a file or folder, else `default_folder`, which is made.
+    """Where a picture goes: `output` as a file or folder, else `default_folder`. Nothing is made yet.
 
     Raises:
         OutputError: it cannot be there.
@@ -54,10 +95,8 @@ def target_path(output: Path | None, default_folder: Path, name: str) -> Path:
             raise OutputError(f"{output}: no folder {output.parent}; make it first")
         return output
     folder = output or default_folder
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from None
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file, not a folder; choose another folder")
     return folder / name
 
 
@@ -67,44 +106,42 @@ def recorded_fps(run_folder: RunFolder) -> float:
     return (run_folder.frames - 1) / (last - first) if first is not None and last > first else 30.0
 
 
-def opened_sequence(arguments: argparse.Namespace) -> tuple[Sequence, str | None]:
-    """The sequence of a command that takes a recording or the output folder of a run, and the run's frontend."""
-    from improvo.cli.options import settings_from
-    from improvo.odometry.run_folder import RunFolder
-    from improvo.odometry.run_settings import RunSettings
-    from improvo.sequences import open_sequence
-
-    path: Path = arguments.sequence
-    if (path / "run.json").is_file():
-        run_folder = RunFolder(path)
-        return run_folder.sequence, str(run_folder.report["configuration"]["frontend"]["name"])
-    return open_sequence(path, settings_from(RunSettings, arguments, {}).sequence), None
-
-
 def write_pictures(
     arguments: argparse.Namespace,
     default_folder: Path,
-    positions: list[int],
+    frames: list[int],
     paint: Callable[[int], UInt8],
     fps: float,
 ) -> None:
-    """The pictures of the chosen frames as one sheet, one PNG each, or a video, as the arguments say."""
-    from tqdm import tqdm
+    """The pictures of the chosen frames as one sheet, one PNG each, or a video, as the arguments say.
 
+    Args:
+        arguments: of `add_frames` and `add_target`.
+        default_folder: where they go without --output.
+        frames: to draw.
+        paint: the picture of a frame.
+        fps: of a video.
+    """
     from improvo.files import write_png
     from improvo.report.sheets import write_sheet, write_video
+    from improvo.terminal import progress
 
-    name = arguments.picture
-    pictures = (paint(p) for p in tqdm(positions, unit="frame", desc=name, disable=len(positions) < _MANY))
-    if arguments.video:
-        target = target_path(arguments.output, default_folder, f"{name}.mp4")
-        write_video(target, pictures, arguments.video_fps or fps)
-    elif arguments.each or len(positions) > _LARGEST_SHEET:
-        target = target_path(arguments.output, default_folder, name)
-        target.mkdir(exist_ok=True)
-        for position, picture in zip(positions, pictures, strict=True):
-            write_png(target / f"{name}_{position:06d}.png", picture)
-    else:
-        target = target_path(arguments.output, default_folder, f"{name}.png")
-        write_sheet(target, list(pictures))
-    print(target)
+    name = arguments.part
+    with progress(name, "frame", len(frames), shown=len(frames) >= _MANY) as shown:
+
+        def painted(frame: int) -> UInt8:
+            shown.advance()
+            return paint(frame)
+
+        pictures = map(painted, frames)
+        if arguments.video:
+            target = target_path(arguments.output, default_folder, f"{name}.mp4")
+            write_video(target, pictures, arguments.video_fps or fps)
+        elif arguments.each or len(frames) > _LARGEST_SHEET:
+            target = target_path(arguments.output, default_folder, name)
+            for frame, picture in zip(frames, pictures, strict=True):
+                write_png(target / f"{name}_{frame:06d}.png", picture)
+        else:
+            target = target_path(arguments.output, default_folder, f"{name}.png")
+            write_sheet(target, list(pictures))
+    say(str(target))

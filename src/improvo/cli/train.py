@@ -1,32 +1,123 @@
-"""`improvo train`: the stages that teach the network."""
+"""`improvo train shapes`, `homographies` and `odometry`: the stages that teach the network."""
 
 from __future__ import annotations
 
 import argparse
-import importlib
-from types import ModuleType
+from pathlib import Path
 
-# stage -> (module under improvo.cli, help line)
-STAGES = {
-    "shapes": ("train_shapes", "a detector from drawn shapes alone (MagicPoint)"),
-    "homographies": ("train_homographies", "detector and descriptor from any pictures, by homographic adaptation"),
-    "odometry": ("train_odometry", "all three heads from labelled video: VO adaptation"),
-}
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add one sub-command per stage; their modules are light until they run."""
-    stages = parser.add_subparsers(dest="stage", metavar="STAGE", required=True)
-    for name, (module_name, help_line) in STAGES.items():
-        module: ModuleType = importlib.import_module(f"improvo.cli.{module_name}")
-        child = stages.add_parser(
-            name, help=help_line, description=module.__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter
-        )
-        module.add_arguments(child)
-        child.set_defaults(stage_module=module)
+from improvo.cli.flags import add_setting
+from improvo.cli.options import settings_from
+from improvo.cli.train_options import (
+    add_data_card,
+    add_training_arguments,
+    print_metrics,
+    read_data_card,
+    starting_weights,
+)
+from improvo.files import check_output_folder
+from improvo.training.settings import HomographiesSettings, OdometryTrainingSettings, ShapesSettings
+from improvo.verbs import need_torch
 
 
-def run(arguments: argparse.Namespace) -> int | None:
-    """Run the chosen stage."""
-    status: int | None = arguments.stage_module.run(arguments)
-    return status
+def add_shapes_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `improvo train shapes`."""
+    add_training_arguments(parser, ShapesSettings())
+
+
+def run_shapes(arguments: argparse.Namespace) -> None:
+    """Train a detector from drawn shapes alone ("MagicPoint"): the start of everything where there are no weights.
+
+    Leaves weights.safetensors, weights.json (model card), metrics.jsonl and checkpoint.pt in OUT; run again to
+    continue.
+    """
+    settings = settings_from(ShapesSettings, arguments)
+    check_output_folder(arguments.output, "train shapes")
+    need_torch()
+    from improvo.training.stages import train_shapes
+
+    metrics = train_shapes(settings, arguments.output, starting_weights(arguments.parent))
+    weights = arguments.output / "weights.safetensors"
+    print_metrics(arguments.output, metrics, f"`improvo train homographies PICTURES --detector {weights} -o network`")
+
+
+def add_homographies_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `improvo train homographies`."""
+    defaults = HomographiesSettings()
+    parser.add_argument(
+        "sources", nargs="+", metavar="SOURCE[=WEIGHT]", help="image folder or sequence; a higher weight is seen more"
+    )
+    parser.add_argument(
+        "--detector", metavar="WEIGHTS", help="label the pictures with this detector: a file, or a bundled name"
+    )
+    add_data_card(parser)
+    loss = "info_nce, or hinge as SuperPoint has it"
+    add_setting(parser, defaults, "--descriptor-loss", "descriptor_loss", help=loss)
+    add_training_arguments(parser, defaults)
+
+
+def run_homographies(arguments: argparse.Namespace) -> None:
+    """Train detector and descriptor from any pictures: homographic adaptation, then pairs of views.
+
+    A source is an image folder or any SEQUENCE. Without --detector the pictures are labelled by classical corners that
+    are found again in many random views; with it by that network, which is also how a second round is made. Leaves
+    weights.safetensors, weights.json (model card), labels.npz, metrics.jsonl and checkpoint.pt in OUT; run again to
+    continue.
+    """
+    settings = settings_from(HomographiesSettings, arguments)
+    check_output_folder(arguments.output, "train homographies")
+    data = read_data_card(arguments.data_card)
+    need_torch()
+    from improvo.training.stages import train_homographies
+
+    metrics = train_homographies(
+        arguments.sources,
+        settings,
+        arguments.output,
+        starting_weights(arguments.parent),
+        starting_weights(arguments.detector),
+        data,
+    )
+    weights = arguments.output / "weights.safetensors"
+    print_metrics(arguments.output, metrics, f"`improvo run SEQUENCE --frontend {weights} -o out` uses them")
+
+
+def add_odometry_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `improvo train odometry`."""
+    parser.add_argument(
+        "labels", nargs="+", type=Path, metavar="LABELS", help="label stores, as `improvo label` makes them"
+    )
+    parser.add_argument(
+        "--pictures",
+        nargs="+",
+        default=[],
+        metavar="SOURCE[=WEIGHT]",
+        help="image folders or sequences to train on beside the labels, as homography pairs, so that the network stays "
+        "general",
+    )
+    add_data_card(parser)
+    add_training_arguments(parser, OdometryTrainingSettings(), parent="superpoint")
+
+
+def run_odometry(arguments: argparse.Namespace) -> None:
+    """Adapt a network to video by visual odometry: train on the labels that `improvo label` made (the paper's step).
+
+    Pairs of frames up to 60 apart, each under its own random homography: stable points teach detector and descriptor,
+    stable against unstable ones the stability head, and what is unknown is ignored. Leaves weights.safetensors,
+    weights.json (model card), metrics.jsonl and checkpoint.pt in OUT; run again to continue.
+    """
+    settings = settings_from(OdometryTrainingSettings, arguments)
+    check_output_folder(arguments.output, "train odometry")
+    data = read_data_card(arguments.data_card)
+    need_torch()
+    from improvo.frontend.weights import find_weights
+    from improvo.training.stages import train_odometry
+
+    start = find_weights(arguments.parent)
+    metrics = train_odometry(arguments.labels, settings, arguments.output, start, data, pictures=arguments.pictures)
+    weights = arguments.output / "weights.safetensors"
+    print_metrics(
+        arguments.output,
+        metrics,
+        f"`improvo run SEQUENCE --frontend {weights} -o out` uses them, `improvo evaluate pose SEQUENCE --frontend "
+        f"{weights} --frontend {arguments.parent}` compares",
+    )

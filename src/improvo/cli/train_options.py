@@ -1,37 +1,28 @@
-"""Options that the training stages share."""
+"""What the commands of the training stages share: options, the model card's data, and what they print at the end."""
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
+import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from improvo.cli.flags import add_setting
 from improvo.cli.options import add_config_arguments
-from improvo.errors import MissingExtraError
-from improvo.training.settings import OptimiserSettings
+from improvo.cli.output import figures, next_step, say
+from improvo.errors import InputError
 
-OPTIMISER_FLAGS = {
-    "architecture": "architecture",
-    "steps": "optimiser.steps",
-    "batch_size": "optimiser.batch_size",
-    "seed": "optimiser.seed",
-    "device": "optimiser.device",
-    "threads": "optimiser.threads",
-    "workers": "optimiser.workers",
-}
+if TYPE_CHECKING:
+    from improvo.frontend.weights import DataSource
 
 
-def add_training_arguments(
-    parser: argparse.ArgumentParser, defaults: OptimiserSettings, parent: str | None = None
-) -> None:
+def add_training_arguments(parser: argparse.ArgumentParser, defaults: Any, parent: str | None = None) -> None:
     """Where to, from which weights, and the settings that change most often.
 
     Args:
-        defaults: of the stage.
+        defaults: settings of the stage.
         parent: the weights that the stage starts from by default; their architecture is kept. None starts anew.
     """
-    absent = argparse.SUPPRESS
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="OUT", help="folder; an unfinished one is continued"
     )
@@ -43,16 +34,42 @@ def add_training_arguments(
         help="weights to start from: a file, or a bundled name",
     )
     if parent is None:
-        parser.add_argument(
-            "--architecture", default=absent, help="superpoint or superpoint-small (default: superpoint)"
-        )
-    parser.add_argument("--steps", type=int, default=absent, help=f"of training (default: {defaults.steps})")
-    parser.add_argument("--batch-size", type=int, default=absent, metavar="N", help=f"(default: {defaults.batch_size})")
-    parser.add_argument("--seed", type=int, default=absent, help=f"(default: {defaults.seed})")
-    parser.add_argument("--device", default=absent, help="cpu, cuda or auto (default: auto)")
-    parser.add_argument("--threads", type=int, default=absent, help="of torch on the CPU (default: its own choice)")
-    parser.add_argument("--workers", type=int, default=absent, help=f"data processes (default: {defaults.workers})")
+        add_setting(parser, defaults, "--architecture", "architecture", help="superpoint or superpoint-small")
+    add_optimiser_arguments(parser, defaults, "optimiser")
+    add_setting(parser, defaults, "--seed", "optimiser.seed", help="of all random choices")
+    add_setting(parser, defaults, "--workers", "optimiser.workers")
     add_config_arguments(parser)
+
+
+def add_optimiser_arguments(parser: argparse._ActionsContainer, defaults: Any, section: str) -> None:
+    """Steps, batch size and device."""
+    add_setting(parser, defaults, "--steps", f"{section}.steps", help="of training")
+    add_setting(parser, defaults, "--batch-size", f"{section}.batch_size")
+    add_setting(parser, defaults, "--device", f"{section}.device", help="to train on: cpu, cuda or auto")
+    add_setting(parser, defaults, "--threads", f"{section}.threads", metavar="N")
+
+
+def add_data_card(parser: argparse.ArgumentParser) -> None:
+    """`--data-card`, read back by `read_data_card`."""
+    parser.add_argument(
+        "--data-card", type=Path, metavar="FILE", help="JSON list of name, licence, attribution for the model card"
+    )
+
+
+def read_data_card(path: Path | None) -> tuple[DataSource, ...]:
+    """What the model card says about the pictures.
+
+    Raises:
+        InputError: not a JSON list of name, licence and attribution.
+    """
+    if path is None:
+        return ()
+    from improvo.frontend.weights import DataSource
+
+    try:
+        return tuple(DataSource(**entry) for entry in json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: must be a JSON list of objects with name, licence, attribution ({error})") from None
 
 
 def starting_weights(parent: str | None) -> Path | None:
@@ -68,14 +85,17 @@ def starting_weights(parent: str | None) -> Path | None:
     return find_weights(parent)
 
 
-def need_torch() -> None:
-    """Raise MissingExtraError where torch is not installed."""
-    if importlib.util.find_spec("torch") is None:
-        raise MissingExtraError("training", "train")
+def print_metrics(output: Path, metrics: dict[str, Any], then: str) -> None:
+    """What a finished stage says.
 
-
-def summary(output: Path, metrics: dict[str, Any]) -> str:
-    """What a finished stage prints."""
+    Args:
+        output: its folder.
+        metrics: the last row.
+        then: what to do next.
+    """
+    weights = output / "weights.safetensors"
     losses = ", ".join(f"{name} {metrics[name]:.3f}" for name in ("loss", "detector", "descriptor") if name in metrics)
     waited = f"{100 * metrics['loading_share']:.0f} % of the time waiting for data"
-    return f"{output / 'weights.safetensors'}: step {metrics['step']}, {losses}; {waited}"
+    figures({"weights": str(weights), **metrics}, "")
+    say(f"{weights}: step {metrics['step']}, {losses}; {waited}")
+    next_step(then)

@@ -7,11 +7,13 @@ has reached so far lies beside FILE, and an interrupted call goes on from there.
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
+from improvo import terminal
 from improvo.cli.evaluate_options import available_cores
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.output import figures, next_step
 from improvo.evaluation.truth.settings import CALIBRATE, TruthCommandSettings, TruthSettings
 
 _FLAGS = {"calibrate": "truth.calibrate", "max_features": "truth.max_features", "seed": "truth.seed"}
@@ -46,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write FILE and its quality as JSON beside it; print the quality."""
-    from tqdm import tqdm
+    from contextlib import ExitStack
 
     from improvo.evaluation.truth.make import make_truth
     from improvo.evaluation.truth.structure_from_motion import load_pycolmap
@@ -55,16 +57,18 @@ def run(arguments: argparse.Namespace) -> int:
     settings = settings_from(TruthCommandSettings, arguments, _FLAGS)
     load_pycolmap()  # said before any work
     sequence = open_sequence(arguments.sequence, settings.sequence)
-    bars: dict[str, Any] = {}
+    before: dict[str, int] = {}  # stage -> how many were done when it was last heard of
+    bar = terminal.Progress()
 
-    def progress(stage: str, done: int, total: int) -> None:
-        if stage not in bars:
-            bars[stage] = tqdm(desc=stage, total=total, disable=None)
-        bars[stage].update(done - bars[stage].n)
-        if done == total:
-            bars[stage].close()
+    def told(stage: str, done: int, total: int) -> None:
+        nonlocal bar
+        if stage not in before:
+            stages.close()
+            bar = stages.enter_context(terminal.progress(stage, "step", total))
+        bar.advance(done - before.get(stage, 0))
+        before[stage] = done
 
-    try:
+    with ExitStack() as stages:
         quality = make_truth(
             sequence,
             arguments.output,
@@ -72,10 +76,8 @@ def run(arguments: argparse.Namespace) -> int:
             scale_from=arguments.scale_from,
             model=arguments.model,
             threads=arguments.workers,
-            progress=progress,
+            progress=told,
         )
-    finally:
-        for bar in bars.values():
-            bar.close()
-    print(f"{arguments.output}: {quality.text()}")
+    figures(asdict(quality), f"{arguments.output}: {quality.text()}")
+    next_step(f"`improvo evaluate trajectory OUT {arguments.sequence} --truth {arguments.output}`")
     return 0

@@ -7,44 +7,38 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+from improvo.cli.output import next_step, say
 from improvo.errors import InputError, OutputError
 from improvo.types import UInt8
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The sub-verbs and their options."""
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-
-    def action(name: str, help_line: str) -> argparse.ArgumentParser:
-        return actions.add_parser(
-            name, help=help_line, description=help_line, formatter_class=argparse.ArgumentDefaultsHelpFormatter
-        )
-
-    importing = action("import", "convert a public SuperPoint weights file (three layouts, .pth or .safetensors)")
-    importing.add_argument("file", type=Path, metavar="FILE")
-    importing.add_argument("-o", "--output", type=Path, default=Path("weights.safetensors"), help="file to write")
-    importing.add_argument("--licence", default="", help="of the file, for the model card")
-    importing.set_defaults(action_function=_import)
-
-    calibrating = action("calibrate", "measure activation ranges on pictures, so that weights can run in int8")
-    calibrating.add_argument("weights", metavar="WEIGHTS", help="a bundled name or a weights file")
-    calibrating.add_argument("images", type=Path, nargs="+", metavar="IMAGES", help="folders or files of pictures")
-    calibrating.add_argument("-o", "--output", type=Path, required=True, help="file to write")
-    calibrating.add_argument("--count", type=int, default=64, help="pictures to use, spread evenly")
-    calibrating.add_argument("--quantile", type=float, default=0.9999, help="of each picture's activations to keep")
-    calibrating.set_defaults(action_function=_calibrate)
-
-    showing = action("show", "print the model card of a weights file")
-    showing.add_argument("weights", metavar="WEIGHTS", help="a bundled name or a weights file")
-    showing.set_defaults(action_function=_show)
+def add_import_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `improvo weights import`."""
+    parser.add_argument("file", type=Path, metavar="FILE")
+    parser.add_argument("-o", "--output", type=Path, default=Path("weights.safetensors"), help="file to write")
+    parser.add_argument("--licence", default="", help="of the file, for the model card")
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Run the chosen sub-verb."""
-    arguments.action_function(arguments)
+def add_calibrate_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `improvo weights calibrate`."""
+    _add_weights(parser)
+    parser.add_argument("images", type=Path, nargs="+", metavar="IMAGES", help="folders or files of pictures")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="file to write")
+    parser.add_argument("--count", type=int, default=64, help="pictures to use, spread evenly")
+    parser.add_argument("--quantile", type=float, default=0.9999, help="of each picture's activations to keep")
 
 
-def _import(arguments: argparse.Namespace) -> None:
+def add_show_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `improvo weights show`."""
+    _add_weights(parser)
+
+
+def _add_weights(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("weights", metavar="WEIGHTS", help="a bundled name or a weights file")
+
+
+def run_import(arguments: argparse.Namespace) -> None:
+    """Convert a public file."""
     from improvo.frontend.importing import convert, read_public_file
     from improvo.frontend.weights import save_weights
 
@@ -52,21 +46,23 @@ def _import(arguments: argparse.Namespace) -> None:
     licence = arguments.licence or "unknown: ask whoever released the original file"
     weights, layout = convert(read_public_file(arguments.file), str(arguments.file), licence)
     save_weights(output, weights.tensors, weights.card)
-    print(f"{arguments.file}: {layout.name} -> {output}")
+    say(f"{arguments.file}: {layout.name} -> {output}")
     if not arguments.licence:
-        print(
+        say(
             "licence: converting does not change whose weights these are. The original SuperPoint release is for "
             "non-commercial research only; read your file's own terms before you use or pass on the result, and "
             "record them with --licence."
         )
+    next_step(f"`improvo run SEQUENCE --frontend {output} -o out` uses them")
 
 
-def _calibrate(arguments: argparse.Namespace) -> None:
+def run_calibrate(arguments: argparse.Namespace) -> None:
+    """Measure activation ranges and write them beside the weights."""
     import cv2
-    from tqdm import tqdm
 
     from improvo.frontend.quantisation import calibrate
     from improvo.frontend.weights import find_weights, load_weights, save_weights
+    from improvo.terminal import progress
 
     output = _checked_output(arguments.output)
     if arguments.count < 1 or not 0 < arguments.quantile <= 1:
@@ -77,22 +73,26 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     unreadable: list[Path] = []
 
     def readable() -> Iterator[UInt8]:
-        for path in tqdm(paths, desc="calibrate", unit="image"):
+        for path in paths:
+            shown.advance()
             image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
             if image is None:
                 unreadable.append(path)
             else:
                 yield image
 
-    calibrated = calibrate(weights, readable(), arguments.quantile)
+    with progress("calibrate", "image", len(paths)) as shown:
+        calibrated = calibrate(weights, readable(), arguments.quantile)
     save_weights(output, calibrated.tensors, calibrated.card)
     if unreadable:
         names = ", ".join(str(path) for path in unreadable[:5])
-        print(f"skipped {len(unreadable)} pictures that cannot be read: {names}")
-    print(f"{output}: activation ranges over {len(paths) - len(unreadable)} pictures")
+        say(f"skipped {len(unreadable)} pictures that cannot be read: {names}")
+    say(f"{output}: activation ranges over {len(paths) - len(unreadable)} pictures")
+    next_step(f"`improvo run SEQUENCE --frontend {output} -o out` runs them in int8")
 
 
-def _show(arguments: argparse.Namespace) -> None:
+def run_show(arguments: argparse.Namespace) -> None:
+    """Print the model card."""
     from improvo import config
     from improvo.frontend.weights import find_weights, load_weights
 

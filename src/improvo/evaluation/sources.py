@@ -130,7 +130,7 @@ def _load(name: str, max_keypoints: int, options: tuple[tuple[str, Any], ...]) -
         return load_peer(name, max_keypoints)
     from improvo.frontend.registry import load_frontend
 
-    return load_frontend(name, max_keypoints=max_keypoints, **dict(options))
+    return load_frontend(name, max_keypoints, opencv_defaults=True, **dict(options))
 
 
 def _version(package: str) -> str | None:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from improvo.errors import OutputError
 from improvo.export.model import Model, image_name
 from improvo.files import write_text
 from improvo.geometry.camera import Camera
@@ -26,10 +25,6 @@ def write_colmap(model: Model, camera: Camera, folder: Path, colours: UInt8 | No
         folder: made if need be.
         colours: (P, 3) RGB of the points.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from None
     write_text(folder / "cameras.txt", _camera(camera))
     order = np.lexsort((model.point, model.frame))  # observations by image; the place in the image is POINT2D_IDX
     bounds = np.searchsorted(model.frame[order], np.arange(len(model.frames) + 1))
@@ -48,11 +43,11 @@ def _camera(camera: Camera) -> str:
 
 def _images(model: Model, order: np.ndarray, bounds: np.ndarray) -> str:
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then X Y POINT3D_ID of each observation\n"]
-    for row, position in enumerate(model.frames.tolist()):
+    for row, frame in enumerate(model.frames.tolist()):
         pose = model.cam_from_world[row]
         x, y, z, w = (float(value) for value in quat_xyzw_from_rotation(pose[:3, :3]))
         numbers = " ".join(repr(value) for value in (w, x, y, z, *pose[:3, 3].tolist()))
-        lines.append(f"{row + 1} {numbers} 1 {image_name(position)}\n")
+        lines.append(f"{row + 1} {numbers} 1 {image_name(frame)}\n")
         rows = order[bounds[row] : bounds[row + 1]]
         pixels, points = (model.keypoints[rows] + 0.5).tolist(), (model.point[rows] + 1).tolist()
         lines.append(" ".join(f"{u!r} {v!r} {p}" for (u, v), p in zip(pixels, points, strict=True)) + "\n")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
-from improvo.errors import InputError, OutputError
+from improvo.errors import InputError
 from improvo.files import write_png
 from improvo.geometry import se3
 from improvo.odometry.run_folder import RunFolder
@@ -19,7 +19,7 @@ from improvo.types import Float64, Int64, UInt8
 class Model:
     """One segment; points and observations refer to `frames` by row."""
 
-    frames: Int64  # (F,) position in the processed sequence
+    frames: Int64  # (F,) frame_index of each
     cam_from_world: Float64  # (F, 4, 4)
     xyz: Float64  # (P, 3)
     stability: Int64  # (P,) label codes
@@ -97,25 +97,29 @@ def segments_by_length(run: RunFolder) -> list[int]:
     return [int(number) for number in numbers[np.argsort(-counts, kind="stable")]]
 
 
-def image_name(position: int) -> str:
+def image_name(frame: int) -> str:
     """The file name of a frame in an export."""
-    return f"frame_{position:06d}.png"
+    return f"frame_{frame:06d}.png"
 
 
-def write_images(run: RunFolder, model: Model, folder: Path) -> UInt8:
-    """Write the frames, undistorted as the run saw them; returns the RGB (P, 3) of each point where first seen."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from None
+def write_images(run: RunFolder, model: Model, folder: Path, advance: Callable[[], None] = lambda: None) -> UInt8:
+    """Write the frames, undistorted as the run saw them; returns the RGB (P, 3) of each point where first seen.
+
+    Args:
+        run: whose recording they come from.
+        model: whose frames.
+        folder: made if need be.
+        advance: is called after every frame.
+    """
     colours = np.full((len(model.xyz), 3), 128, np.uint8)
     first = np.flatnonzero(np.diff(model.point, prepend=-1))
     pixels = np.rint(model.keypoints[first]).astype(np.int64)
-    for row, position in enumerate(tqdm(model.frames.tolist(), unit="frame", desc="images", disable=None)):
-        image = run.colour(position)
-        write_png(folder / image_name(position), image)
+    for row, frame in enumerate(model.frames.tolist()):
+        image = run.colour(frame)
+        write_png(folder / image_name(frame), image)
         here = np.flatnonzero(model.frame[first] == row)
         v = np.clip(pixels[here, 1], 0, image.shape[0] - 1)
         u = np.clip(pixels[here, 0], 0, image.shape[1] - 1)
         colours[model.point[first[here]]] = image[v, u]
+        advance()
     return colours

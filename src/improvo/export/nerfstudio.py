@@ -39,8 +39,8 @@ def write_nerfstudio(model: Model, camera: Camera, folder: Path, colours: UInt8)
             "p2": 0.0,
             "ply_file_path": _POINT_CLOUD,
             "frames": [
-                {"file_path": f"images/{image_name(position)}", "transform_matrix": pose.tolist()}
-                for position, pose in zip(model.frames.tolist(), world_from_cam, strict=True)
+                {"file_path": f"images/{image_name(frame)}", "transform_matrix": pose.tolist()}
+                for frame, pose in zip(model.frames.tolist(), world_from_cam, strict=True)
             ],
         },
     )

@@ -77,7 +77,7 @@ class _Graph:
 
     def node(self, kind: str, *inputs: str, name: str | None = None, outputs: int = 1, **attributes: Any) -> Any:
         names = [name or f"{kind}_{len(self.nodes)}"] if outputs == 1 else []
-        names = names or [f"{kind}_{len(self.nodes)}_{position}" for position in range(outputs)]
+        names = names or [f"{kind}_{len(self.nodes)}_{number}" for number in range(outputs)]
         self.nodes.append(self._helper.make_node(kind, list(inputs), names, **attributes))
         return names[0] if outputs == 1 else names
 
@@ -129,9 +129,9 @@ def _network(graph: _Graph, weights: Weights, image: str) -> dict[str, str]:
     """Raw output of every head."""
     layers = {layer.convolution.name: layer for layer in weights.folded()}
     shared = image
-    for position in range(len(weights.architecture.encoder)):
-        shared = _convolution(graph, layers[f"encoder.{position}"], shared)
-        if position in POOL_AFTER:
+    for number in range(len(weights.architecture.encoder)):
+        shared = _convolution(graph, layers[f"encoder.{number}"], shared)
+        if number in POOL_AFTER:
             shared = graph.node("MaxPool", shared, kernel_shape=[2, 2], strides=[2, 2])
     heads = weights.architecture.heads
     first = {head: _convolution(graph, layers[f"{head}.0"], shared) for head in heads}

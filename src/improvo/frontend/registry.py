@@ -1,62 +1,75 @@
-"""Frontends by name."""
+"""Frontends by name. A new one is a class behind the `Frontend` protocol, and a line of `load_frontend`."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from improvo.errors import ConfigError
 from improvo.frontend import Frontend
+from improvo.frontend.settings import DEFAULT_FRONTEND, FrontendSettings, NetworkOptions, NetworkSettings
 
 CLASSICAL = ("sift", "orb", "akaze", "surf")
 NETWORKS = ("superpoint-vo", "superpoint", "superpoint-small")
 
 
-def load_frontend(name: str, max_keypoints: int = 1000, **options: Any) -> Frontend:
-    """A frontend by its bundled name, or from a weights file.
+def load_frontend(
+    name: str = DEFAULT_FRONTEND,
+    max_keypoints: int = 1000,
+    *,
+    least_stability: float = 0.0,
+    network: NetworkOptions | None = None,
+    opencv_defaults: bool = False,
+) -> Frontend:
+    """A frontend by its bundled name, or from a weights file, as `improvo run` uses it.
+
+    The classical ones are tuned for odometry: they detect weakly textured points too, and ORB spreads its points over
+    the image.
 
     Args:
         name: `sift`, `orb`, `akaze`, `surf`, a bundled network, or the path of a `.safetensors` file.
         max_keypoints: keypoints kept per image, best first.
-        options: of that frontend, such as `sensitive` of the classical ones.
+        least_stability: keypoints that the stability head gives a lower probability are dropped; 0 keeps all.
+        network: threshold, device, precision and the rest of a network.
+        opencv_defaults: the classical frontends as OpenCV has them, which the paper compares with.
 
     Raises:
-        ConfigError: an unknown name or option.
+        ConfigError: an unknown name, network options for a classical frontend, or `least_stability` for a frontend
+            without a stability head.
         InputError: a weights file that cannot be read.
     """
-    try:
-        if name == "surf":
-            from improvo.frontend.classical import SurfFrontend
+    if name in CLASSICAL and network not in (None, NetworkOptions()):
+        raise ConfigError(f"frontend {name}: is not a network, so the settings `frontend.network` do not apply to it")
+    if name == "surf":
+        from improvo.frontend.classical import SurfFrontend
 
-            return SurfFrontend(max_keypoints, **options)
-        if name in CLASSICAL:
-            from improvo.frontend.classical import ClassicalFrontend
+        frontend: Frontend = SurfFrontend(max_keypoints, sensitive=not opencv_defaults)
+    elif name in CLASSICAL:
+        from improvo.frontend.classical import ClassicalFrontend
 
-            return ClassicalFrontend(name, max_keypoints, **options)
-        if name in NETWORKS or Path(name).suffix == ".safetensors":
-            from improvo.frontend.network import load_network_frontend
+        spread = name == "orb" and not opencv_defaults
+        frontend = ClassicalFrontend(name, max_keypoints, sensitive=not opencv_defaults, spread=spread)
+    elif name in NETWORKS or Path(name).suffix == ".safetensors":
+        from improvo.frontend.network import NetworkFrontend
+        from improvo.frontend.weights import find_weights, load_weights
 
-            return load_network_frontend(name, max_keypoints=max_keypoints, **options)
-    except TypeError as error:
-        raise ConfigError(f"frontend {name!r}: {error}") from None
-    known = ", ".join((*NETWORKS, *CLASSICAL))
-    raise ConfigError(f"frontend {name!r}: unknown; choose among {known}, or give a .safetensors weights file")
-
-
-def load_odometry_frontend(name: str, max_keypoints: int = 1000, least_stability: float = 0.0) -> Frontend:
-    """As `load_frontend`, with the classical frontends tuned for odometry: weak points too, spread over the image.
-
-    Args:
-        least_stability: keypoints of less stability are dropped; 0 keeps all.
-    """
-    options: dict[str, Any] = {}
-    if name in CLASSICAL:
-        options["sensitive"] = True
-    if name == "orb":
-        options["spread"] = True
-    frontend = load_frontend(name, max_keypoints, **options)
+        settings = NetworkSettings(max_keypoints=max_keypoints, **asdict(network or NetworkOptions()))
+        frontend = NetworkFrontend(load_weights(find_weights(name)), settings, name=name)
+    else:
+        known = ", ".join((*NETWORKS, *CLASSICAL))
+        raise ConfigError(f"frontend {name!r}: unknown; choose among {known}, or give a .safetensors weights file")
     if not least_stability:
         return frontend
     from improvo.frontend.stable_only import StableOnly
 
     return StableOnly(frontend, least_stability)
+
+
+def frontend_from(settings: FrontendSettings) -> Frontend:
+    """The frontend that the settings of a run name. Raises as `load_frontend`."""
+    return load_frontend(
+        settings.name,
+        settings.max_keypoints,
+        least_stability=settings.least_stability,
+        network=settings.network,
+    )

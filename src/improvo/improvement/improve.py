@@ -7,18 +7,20 @@ and is skipped where that is there.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from improvo.improvement.candidate import Candidate, publish, starting_weights
-from improvo.improvement.held_back import Split
-from improvo.improvement.judgement import Judgement, is_better, rule, scores
+import numpy as np
+
+from improvo.frontend.weights import load_weights, save_weights
+from improvo.improvement.folder import Candidate, ImproveFolder
+from improvo.improvement.progress import ImprovementProgress
 from improvo.improvement.report import write_report
+from improvo.improvement.rounds import Rounds, Train, starting_weights
 from improvo.improvement.settings import ImproveSettings
-from improvo.improvement.steps import Steps, Train
-from improvo.improvement.telling import Telling
-from improvo.improvement.workspace import Workspace
+from improvo.improvement.split import Split
+from improvo.improvement.validation import Validation, is_better, rule, scores
 
 if TYPE_CHECKING:
     from improvo.frontend.weights import DataSource
@@ -31,7 +33,7 @@ class Improvement:
     weights: Path  # of the best frontend, which is the one at the start if no round was better
     best: int  # its row in the following
     candidates: tuple[Candidate, ...]  # the first is the start
-    judgements: tuple[Judgement, ...]
+    validations: tuple[Validation, ...]
 
 
 def improve(
@@ -43,7 +45,7 @@ def improve(
     workers: int | None = None,
     ray: str | None = None,
     data: tuple[DataSource, ...] = (),
-    telling: Telling | None = None,
+    progress: ImprovementProgress | None = None,
     train: Train | None = None,
 ) -> Improvement:
     """Improve a frontend on recordings without ground truth.
@@ -52,11 +54,12 @@ def improve(
         sequences: the recordings; part of them is held back and never trained on.
         output: folder of the result; an unfinished one is continued.
         settings: all of them; `settings.frontend.name` is where the loop starts.
-        rounds: of labelling, training and judging.
+        rounds: of labelling, training and validation.
         evaluate: recordings to hold back; without any, some of `sequences`, or the last part of a single one.
-        workers, ray: who labels many sequences, see `improvo.labeling.label_sequences.label_sequences`.
+        workers: sequences labelled at a time, a process for each.
+        ray: address of a Ray cluster that labels them, see `improvo.jobs.on_ray`.
         data: what the model card says about the recordings.
-        telling: shows progress and results.
+        progress: is told progress and results.
         train: in place of `improvo.training.stages.train_odometry`.
 
     Raises:
@@ -64,43 +67,58 @@ def improve(
         ConfigError: the folder was begun with other settings.
         OutputError: the folder is not ours, or cannot be written (full disk).
     """
-    telling = telling or Telling()
+    progress = progress or ImprovementProgress()
     first_weights = starting_weights(settings.frontend.name)
-    workspace = Workspace(output, sequences, evaluate, settings, first_weights)
-    steps = Steps(workspace, settings, train or _train_odometry, data, workers, ray, telling)
+    folder = ImproveFolder(output, sequences, evaluate, settings, first_weights)
+    loop = Rounds(folder, settings, train or _train_odometry, data, workers, ray, progress)
 
-    split = steps.hold_back(sequences, evaluate, first_weights)
-    telling.split(split)
-    start = steps.begin(first_weights, split.training)
-    result = Improvement(workspace.weights, 0, (start,), (steps.judge(start, split.held_back),))
-    telling.judged(start, result.judgements[0], result.judgements[0], better=None)
-    _keep(result, workspace, split, settings)
-    for number in range(1, max(rounds, workspace.rounds_judged()) + 1):
+    split = loop.split(sequences, evaluate, first_weights)
+    progress.split(split)
+    start = loop.start(first_weights, split.training)
+    result = Improvement(folder.weights, 0, (start,), (loop.validate(start, split.held_back),))
+    progress.validated(start, result.validations[0], result.validations[0], better=None)
+    _keep(result, folder, split, settings)
+    for number in range(1, max(rounds, folder.finished_rounds()) + 1):
         teacher = result.candidates[result.best]
-        candidate = workspace.round(number)
-        if not candidate.judgement.is_file():
-            steps.label(teacher, split.training)
-            steps.learn(candidate, number, teacher, split.training)
-        judgement = steps.judge(candidate, split.held_back)
-        better = is_better(judgement, result.judgements[result.best], settings.judge)
-        telling.judged(candidate, judgement, result.judgements[0], better)
+        candidate = folder.round(number)
+        if not candidate.validation.is_file():
+            loop.label(teacher, split.training)
+            loop.train(candidate, number, teacher, split.training)
+        validation = loop.validate(candidate, split.held_back)
+        better = is_better(validation, result.validations[result.best], settings.validation)
+        progress.validated(candidate, validation, result.validations[0], better)
         result = Improvement(
-            workspace.weights,
+            folder.weights,
             number if better else result.best,
             (*result.candidates, candidate),
-            (*result.judgements, judgement),
+            (*result.validations, validation),
         )
-        _keep(result, workspace, split, settings)
+        _keep(result, folder, split, settings)
     return result
 
 
-def _keep(result: Improvement, workspace: Workspace, split: Split, settings: ImproveSettings) -> None:
+def _keep(result: Improvement, folder: ImproveFolder, split: Split, settings: ImproveSettings) -> None:
     """Leave the best weights and the report of this round, unless an earlier run has left those of a later one."""
-    if len(result.candidates) <= workspace.rounds_judged():
+    if len(result.candidates) <= folder.finished_rounds():
         return
-    best, judgement = result.candidates[result.best], result.judgements[result.best]
-    publish(best, workspace.weights, rule(settings.judge), scores(judgement, result.judgements[0]))
-    write_report(workspace.report, result.candidates, result.judgements, result.best, split, settings)
+    best, validation = result.candidates[result.best], result.validations[result.best]
+    _publish(best, folder.weights, rule(settings.validation), scores(validation, result.validations[0]))
+    write_report(folder.report, result.candidates, result.validations, result.best, split, settings)
+
+
+def _publish(best: Candidate, target: Path, words: str, measures: dict[str, float]) -> None:
+    """Put the weights of a candidate where the user looks for them, with what was measured of them in their card.
+
+    A file that says so already is left alone.
+    """
+    weights = load_weights(best.weights)
+    metrics = {**weights.card.metrics, "improvement": {"kept": best.name, "rule": words, **measures}}
+    card = replace(weights.card, metrics=metrics)
+    if target.is_file() and target.with_suffix(".json").is_file():
+        written = load_weights(target)
+        if written.card == card and all(np.array_equal(written.tensors[k], v) for k, v in weights.tensors.items()):
+            return
+    save_weights(target, weights.tensors, card)
 
 
 def _train_odometry(*arguments: Any, **options: Any) -> dict[str, Any]:

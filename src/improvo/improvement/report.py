@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,11 +10,11 @@ from improvo.errors import InputError
 from improvo.evaluation.pose.unlabelled import spread_pairs
 from improvo.files import write_png
 from improvo.frontend.weights import load_weights
-from improvo.improvement.candidate import Candidate, training_losses
-from improvo.improvement.held_back import Part, Split
-from improvo.improvement.judgement import Judgement, rule
+from improvo.improvement.folder import Candidate
+from improvo.improvement.progress import gain_words
 from improvo.improvement.settings import ImproveSettings
-from improvo.improvement.telling import gain_words
+from improvo.improvement.split import Part, Split
+from improvo.improvement.validation import Validation, rule
 from improvo.labeling.store import DONE, read_records
 from improvo.report.improvement_page import Measure, Round, write_improvement_page
 from improvo.sequences import open_sequence
@@ -26,7 +27,7 @@ _SINGLE = 800
 def write_report(
     path: Path,
     candidates: Sequence[Candidate],
-    judgements: Sequence[Judgement],
+    validations: Sequence[Validation],
     best: int,
     split: Split,
     settings: ImproveSettings,
@@ -35,34 +36,34 @@ def write_report(
 
     Args:
         path: the HTML file.
-        candidates, judgements: of the start, then of every round.
+        candidates, validations: of the start, then of every round.
         best: which of them is kept.
         split: what was held back.
         settings: of the loop.
     """
-    start = judgements[0]
+    start = validations[0]
     rounds = [
-        _round(candidate, judgement, split, settings, pictures=number in (0, best))
-        for number, (candidate, judgement) in enumerate(zip(candidates, judgements, strict=True))
+        _round(candidate, validation, split, settings, pictures=number in (0, best))
+        for number, (candidate, validation) in enumerate(zip(candidates, validations, strict=True))
     ]
     names = ", ".join(one.name for one in split.training.paths[:3])
     if len(split.training.paths) > 3:
         names += f" and {len(split.training.paths) - 3} more"
     write_improvement_page(
         path,
-        "A frontend that teaches itself",
-        f"{Path(settings.frontend.name).name}, improved on {names}; judged on what it never saw, {split.words}.",
+        f"A frontend improved on {names}",
+        f"{Path(settings.frontend.name).name}, validated on what it never saw, {split.words}.",
         _measures(start, settings),
         rounds,
-        _notes(candidates, judgements, split, settings),
+        _notes(candidates, validations, split, settings),
         best,
-        _verdict(candidates, judgements, best, settings),
+        _verdict(candidates, validations, best, settings),
     )
 
 
-def _measures(start: Judgement, settings: ImproveSettings) -> list[Measure]:
+def _measures(start: Validation, settings: ImproveSettings) -> list[Measure]:
     gaps = start.gaps
-    keypoints, pixels = settings.judge.survival.max_keypoints, settings.judge.survival.max_epipolar_error
+    keypoints, pixels = settings.validation.survival.max_keypoints, settings.validation.survival.max_epipolar_error
     measures = [
         Measure(
             _score_name(start),
@@ -86,29 +87,39 @@ def _measures(start: Judgement, settings: ImproveSettings) -> list[Measure]:
     return measures
 
 
-def _score_name(judgement: Judgement) -> str:
-    one = len(judgement.gaps) == 1
-    return f"matches that survive {judgement.gaps[0]} frames" if one else "matches that survive, summed over the gaps"
+def _score_name(validation: Validation) -> str:
+    one = len(validation.gaps) == 1
+    return f"matches that survive {validation.gaps[0]} frames" if one else "matches that survive, summed over the gaps"
 
 
-def _values(judgement: Judgement) -> dict[str, float]:
-    values = {_score_name(judgement): judgement.score}
-    for gap in judgement.gaps:
-        values[f"matches that survive {gap} frames"] = judgement.surviving(gap)
-        values[f"share of keypoints that survive {gap} frames"] = judgement.share[str(gap)]
-    values["frames tracked"] = judgement.tracked / max(judgement.frames, 1)
-    values["track length"] = judgement.track_length
-    values["stable tracks"] = judgement.stable_share
-    if judgement.error == judgement.error:
-        values["re-projection error, pixels"] = judgement.error
-    return {**values, **judgement.pose}
+def _training_losses(folder: Path) -> dict[str, list[float]]:
+    """The rows of `metrics.jsonl`, by column; empty where nothing was trained."""
+    try:
+        rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    except FileNotFoundError:
+        return {}
+    names = [name for name in rows[0] if all(name in row for row in rows)] if rows else []
+    return {name: [float(row[name]) for row in rows] for name in names}
+
+
+def _values(validation: Validation) -> dict[str, float]:
+    values = {_score_name(validation): validation.score}
+    for gap in validation.gaps:
+        values[f"matches that survive {gap} frames"] = validation.surviving(gap)
+        values[f"share of keypoints that survive {gap} frames"] = validation.share[str(gap)]
+    values["frames tracked"] = validation.tracked / max(validation.frames, 1)
+    values["track length"] = validation.track_length
+    values["stable tracks"] = validation.stable_share
+    if validation.error == validation.error:
+        values["re-projection error, pixels"] = validation.error
+    return {**values, **validation.pose}
 
 
 def _round(
-    candidate: Candidate, judgement: Judgement, split: Split, settings: ImproveSettings, pictures: bool
+    candidate: Candidate, validation: Validation, split: Split, settings: ImproveSettings, pictures: bool
 ) -> Round:
-    losses = training_losses(candidate.training)
-    seconds = {"label what is held back": judgement.seconds["label"], "evaluate": judgement.seconds["evaluate"]}
+    losses = _training_losses(candidate.training)
+    seconds = {"label what is held back": validation.seconds["label"], "evaluate": validation.seconds["evaluate"]}
     labels: dict[str, int] = {}
     if candidate.labels.is_dir():
         records = [record for record in read_records(candidate.labels) if record.state == DONE]
@@ -119,20 +130,20 @@ def _round(
         seconds = {"train": float(trained["seconds"]), **seconds}
     return Round(
         candidate.name,
-        _values(judgement),
+        _values(validation),
         labels,
         seconds,
-        _pictures(candidate, split, judgement, settings) if pictures else (),
+        _pictures(candidate, split, validation, settings) if pictures else (),
         {name: losses[name] for name in ("step", *_LOSSES) if name in losses},
     )
 
 
 def _verdict(
-    candidates: Sequence[Candidate], judgements: Sequence[Judgement], best: int, settings: ImproveSettings
+    candidates: Sequence[Candidate], validations: Sequence[Validation], best: int, settings: ImproveSettings
 ) -> str:
-    words = rule(settings.judge)
+    words = rule(settings.validation)
     if best:
-        gain = gain_words(judgements[best], judgements[0])
+        gain = gain_words(validations[best], validations[0])
         return f"{words} Kept: {candidates[best].name}; matches that survive against the start: {gain}."
     if len(candidates) > 1:
         return f"{words} No round was better than the start: the weights kept are those at the start, unchanged."
@@ -140,19 +151,19 @@ def _verdict(
 
 
 def _notes(
-    candidates: Sequence[Candidate], judgements: Sequence[Judgement], split: Split, settings: ImproveSettings
+    candidates: Sequence[Candidate], validations: Sequence[Validation], split: Split, settings: ImproveSettings
 ) -> list[str]:
-    start, notes = judgements[0], list[str]()
-    if start.gaps != settings.judge.survival.gaps:
-        missing = " and ".join(str(gap) for gap in settings.judge.survival.gaps if gap not in start.gaps)
+    start, notes = validations[0], list[str]()
+    if start.gaps != settings.validation.survival.gaps:
+        missing = " and ".join(str(gap) for gap in settings.validation.survival.gaps if gap not in start.gaps)
         used = " and ".join(map(str, start.gaps))
         notes.append(
             f"What is held back is too short for pairs {missing} frames apart: judged by pairs {used} frames apart. "
             "Short gaps are easy; judge by longer recordings before you believe a small gain."
         )
     notes += [f"Left out: {reason}" for reason in split.unusable]
-    for candidate, judgement in zip(candidates, judgements, strict=True):
-        notes += [f"{candidate.name}, no labels of {failure}" for failure in judgement.failures]
+    for candidate, validation in zip(candidates, validations, strict=True):
+        notes += [f"{candidate.name}, no labels of {failure}" for failure in validation.failures]
         if candidate.labels.is_dir():
             failed = [record for record in read_records(candidate.labels) if record.state != DONE]
             notes += [f"{candidate.name}, not trained on {record.name}: {record.reason}" for record in failed]
@@ -160,7 +171,7 @@ def _notes(
 
 
 def _pictures(
-    candidate: Candidate, split: Split, judgement: Judgement, settings: ImproveSettings
+    candidate: Candidate, split: Split, validation: Validation, settings: ImproveSettings
 ) -> tuple[tuple[Path, str], ...]:
     """Matches of a pair held back, the labels that it makes there, and its stability; drawn once."""
     pictures = []
@@ -173,7 +184,7 @@ def _pictures(
         if not target.is_file():
             target.parent.mkdir(exist_ok=True)
             try:
-                draw(target, candidate, split.held_back, judgement, settings)
+                draw(target, candidate, split.held_back, validation, settings)
             except InputError:  # a frame that cannot be read, no stability head, no labels: no picture
                 continue
         pictures.append((target, caption))
@@ -181,15 +192,15 @@ def _pictures(
 
 
 def _draw_matches(
-    target: Path, candidate: Candidate, part: Part, judgement: Judgement, settings: ImproveSettings
+    target: Path, candidate: Candidate, part: Part, validation: Validation, settings: ImproveSettings
 ) -> None:
     from improvo.frontend.registry import load_frontend
     from improvo.report.match_picture import paint_matches
 
-    frontend = load_frontend(str(candidate.weights), settings.judge.survival.max_keypoints)
+    frontend = load_frontend(str(candidate.weights), settings.validation.survival.max_keypoints)
     frontend.name = candidate.name
     sequence = open_sequence(part.paths[0], part.sequence)
-    pairs = spread_pairs(len(sequence), judgement.gaps[0], settings.judge.survival.pairs)
+    pairs = spread_pairs(len(sequence), validation.gaps[0], settings.validation.survival.pairs)
     if len(pairs) == 0:
         raise InputError(f"{part.paths[0]}: too short for a pair")
     a, b = (int(row) for row in pairs[len(pairs) // 2])
@@ -198,7 +209,7 @@ def _draw_matches(
 
 
 def _draw_stability(
-    target: Path, candidate: Candidate, part: Part, judgement: Judgement, settings: ImproveSettings
+    target: Path, candidate: Candidate, part: Part, validation: Validation, settings: ImproveSettings
 ) -> None:
     from improvo.frontend.network import load_network_frontend
     from improvo.report.stability_picture import paint_stability
@@ -210,7 +221,7 @@ def _draw_stability(
 
 
 def _draw_labels(
-    target: Path, candidate: Candidate, part: Part, judgement: Judgement, settings: ImproveSettings
+    target: Path, candidate: Candidate, part: Part, validation: Validation, settings: ImproveSettings
 ) -> None:
     from improvo.odometry.run_folder import RunFolder
     from improvo.report.track_pictures import TrackPictureSettings, paint_labels

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 
 from improvo.errors import ConfigError
 from improvo.evaluation.settings import SurvivalSettings
-from improvo.odometry.run_settings import FrontendSettings, RunSettings
+from improvo.frontend.settings import FrontendSettings
+from improvo.odometry.run_settings import RunSettings
 from improvo.odometry.settings import OdometrySettings
 from improvo.sequences.base import SequenceSettings
 from improvo.stability.settings import LabelSettings
@@ -16,18 +17,18 @@ DEFAULT_START = "superpoint"
 
 
 @dataclass(frozen=True)
-class HeldBackSettings:
-    """What training never sees, so that the rounds can be judged on it."""
+class SplitSettings:
+    """What training never sees, so that the rounds can be validated on it."""
 
     share: float = 0.2  # of the sequences, at least one; of a single sequence, its last part
 
     def __post_init__(self) -> None:
         if not 0 < self.share < 1:
-            raise ConfigError(f"held_back.share={self.share}: must be between 0 and 1")
+            raise ConfigError(f"split.share={self.share}: must be between 0 and 1")
 
 
 @dataclass(frozen=True)
-class JudgeSettings:
+class ValidationSettings:
     """How the rounds are compared."""
 
     survival: SurvivalSettings = field(default_factory=SurvivalSettings)
@@ -43,13 +44,13 @@ class ImproveSettings:
     frontend: FrontendSettings = field(default_factory=lambda: FrontendSettings(name=DEFAULT_START))  # at the start
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     labels: LabelSettings = field(default_factory=LabelSettings)
-    held_back: HeldBackSettings = field(default_factory=HeldBackSettings)
+    split: SplitSettings = field(default_factory=SplitSettings)
     training: OdometryTrainingSettings = field(
         default_factory=lambda: OdometryTrainingSettings(
             optimiser=OptimiserSettings(steps=1000, decay_steps=350, learning_rate=5e-4)
         )
     )
-    judge: JudgeSettings = field(default_factory=JudgeSettings)
+    validation: ValidationSettings = field(default_factory=ValidationSettings)
 
     def run_settings(self, sequence: SequenceSettings, frontend: FrontendSettings) -> RunSettings:
         """The odometry's settings for some frames and a frontend."""

@@ -1,4 +1,4 @@
-"""Doing many independent jobs on a Ray cluster.
+"""Few long jobs on a Ray cluster.
 
 The jobs name files and folders, so every node must see them under the same paths (a shared file system), and have the
 same version of this package installed.
@@ -14,7 +14,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from improvo.errors import InputError, MissingExtraError
-from improvo.jobs.processes import ONE_THREAD, POLL_SECONDS, Job, Result, Tick, WorkerDiedError
+from improvo.jobs.processes import Job, Result, Tick
+from improvo.jobs.workers import ONE_THREAD, POLL_SECONDS, WorkerDiedError, with_errors_sent
 
 _WAITING_PER_CORE = 2  # jobs handed to the cluster ahead of their turn
 _CANCEL_SECONDS = 10.0
@@ -35,7 +36,10 @@ def run_on_ray(
     cancels what runs there.
 
     Args:
-        work: a function of a module that the nodes have, since it is sent to them by name; so are the jobs and results.
+        work: a function of a module that the nodes have, since it is sent to them by name.
+        jobs: picklable, as are the results.
+        on_result: is given each job with its answer, or the exception that it ended with.
+        on_ticks: is told that so many more ticks have come.
         address: of the cluster (`host:6379`, `auto`, `ray://host:10001`), or `local` to start one on this machine.
         workers: jobs at a time, at most; as many as the cluster has cores for if None.
 
@@ -46,7 +50,7 @@ def run_on_ray(
     try:
         import ray
     except ImportError:
-        raise MissingExtraError("labelling on a Ray cluster", "ray") from None
+        raise MissingExtraError("work on a Ray cluster", "ray") from None
 
     with _connected(ray, address):
         counter = ray.remote(num_cpus=0)(_Counter).remote()
@@ -107,7 +111,7 @@ def _work(work: Callable[[Job, Tick], Result], job: Job, counter: Any, folder: s
             untold, last = 0, time.monotonic()
 
     try:
-        return work(job, tick)
+        return with_errors_sent(work, job, tick)
     finally:
         import ray
 

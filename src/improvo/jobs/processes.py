@@ -1,31 +1,22 @@
-"""Doing many independent jobs: one after another in this process, or in several local processes (Ray: `on_ray`)."""
+"""Few long jobs, one after another in this process, or in several local processes (on a cluster: `on_ray`)."""
 
 from __future__ import annotations
 
 import multiprocessing
-import os
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from typing import Any, TypeVar
 
-from improvo.errors import ImprovoError
+from improvo.jobs.workers import POLL_SECONDS, WorkerDiedError, one_thread_each, start_worker, with_errors_sent
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 Tick = Callable[[], None]  # a job calls it as it goes on; raises KeyboardInterrupt when all is to stop
 
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-POLL_SECONDS = 0.2
-
 _worker_ticks: Any = None  # set in worker processes
 _worker_stop: Any = None
-
-
-class WorkerDiedError(ImprovoError):
-    """A worker process ended without an answer."""
 
 
 def run_here(
@@ -34,7 +25,14 @@ def run_here(
     on_result: Callable[[Job, Result | Exception], None],
     on_ticks: Callable[[int], None],
 ) -> None:
-    """One job after another; an exception of a job is its result, KeyboardInterrupt ends all."""
+    """One job after another; an exception of a job is its result, KeyboardInterrupt ends all.
+
+    Args:
+        work: does a job.
+        jobs: in this order.
+        on_result: is given each job with its answer, or the exception that it ended with.
+        on_ticks: is told that so many more ticks have come.
+    """
     for job in jobs:
         try:
             result: Result | Exception = work(job, lambda: on_ticks(1))
@@ -55,7 +53,11 @@ def run_in_processes(
     A process that dies is a `WorkerDiedError` of the job that it had; another takes its place for the jobs that wait.
 
     Args:
-        work: a function of a module, since it is sent to the workers by name; so are the jobs and results.
+        work: a function of a module, since it is sent to the processes by name.
+        jobs: picklable, as are the results.
+        on_result: is given each job with its answer, or the exception that it ended with.
+        on_ticks: is told that so many more ticks have come.
+        workers: processes, at most.
     """
     context = multiprocessing.get_context("spawn")
     # No locks: a killed process would keep them. Each counter has one writer at a time.
@@ -72,15 +74,15 @@ def run_in_processes(
             on_ticks(count - told)
             told = count
 
-    with _one_blas_thread():
+    with one_thread_each():
         # A pool of one process per place, because a pool is lost as a whole when one of its processes dies.
-        pools = [ProcessPoolExecutor(1, context, _start_worker, (counter, stop)) for counter in counters]
+        pools = [ProcessPoolExecutor(1, context, _start, (counter, stop)) for counter in counters]
         try:
             idle = list(range(len(pools)))
             while waiting or running:
                 while waiting and idle:
                     place, job = idle.pop(), waiting.popleft()
-                    running[pools[place].submit(_work, work, job)] = job, place
+                    running[pools[place].submit(with_errors_sent, _work, work, job)] = job, place
                 done, _ = wait(running, timeout=POLL_SECONDS, return_when=FIRST_COMPLETED)
                 tell()
                 for future in done:
@@ -88,7 +90,7 @@ def run_in_processes(
                     result = _result(future)
                     if isinstance(result, WorkerDiedError):
                         pools[place].shutdown()
-                        pools[place] = ProcessPoolExecutor(1, context, _start_worker, (counters[place], stop))
+                        pools[place] = ProcessPoolExecutor(1, context, _start, (counters[place], stop))
                     idle.append(place)
                     on_result(job, result)
             tell()
@@ -110,31 +112,11 @@ def _result(future: Future[Any]) -> Any:
         return error
 
 
-@contextmanager
-def _one_blas_thread() -> Iterator[None]:
-    """For the processes that start meanwhile: their libraries read it when they load."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(ONE_THREAD)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _start_worker(ticks: Any, stop: Any) -> None:
-    """In a new worker: leave Ctrl-C to the parent, which passes it on through `stop`."""
-    import signal
-
-    import cv2
-
+def _start(ticks: Any, stop: Any) -> None:
+    """In a new worker."""
     global _worker_ticks, _worker_stop
     _worker_ticks, _worker_stop = ticks, stop
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    cv2.setNumThreads(1)
+    start_worker()
 
 
 def _work(work: Callable[[Job, Tick], Result], job: Job) -> Result:

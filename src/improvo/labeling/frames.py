@@ -23,11 +23,11 @@ _JPEG_QUALITY = 95
 class FramesTable:
     """`frames.parquet`: one row per processed frame."""
 
-    frame: Int64  # (F,) position in the processed sequence, as in tracks.parquet
-    index: Int64  # (F,) in the recording
+    frame: Int64  # (F,) index in the processed sequence, as in tracks.parquet
+    source_index: Int64  # (F,) index in the recording; the file's column is `index`
     time: Float64  # (F,) seconds
     segment: Int64  # (F,) -1 without a pose
-    trusted: NDArray[np.bool_]  # (F,) by the second opinion
+    trusted: NDArray[np.bool_]  # (F,) by the quality gate
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -40,7 +40,7 @@ def write_frames(path: Path, frames: FramesTable) -> None:
 
     columns = {
         "frame": frames.frame.astype(np.int32),
-        "index": frames.index.astype(np.int32),
+        "index": frames.source_index.astype(np.int32),
         "time": frames.time,
         "segment": frames.segment.astype(np.int32),
         "trusted": frames.trusted,
@@ -119,7 +119,7 @@ class PackedImages:
         self._group: tuple[int, list[bytes]] = (-1, [])
 
     def __getitem__(self, frame: int) -> UInt8:
-        """The grey image (H, W) at a position of the processed sequence."""
+        """The grey image (H, W) of a frame of the processed sequence."""
         import cv2
         import pyarrow.parquet as pq
 

@@ -1,4 +1,4 @@
-"""Labelling many sequences: odometry, labels and second opinion for each, resumable, one failure spoils no other."""
+"""Labels of many sequences: resumable, and the failure of one spoils no other."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from improvo.errors import ImprovoError, InputError, OutputError
 from improvo.jobs.on_ray import run_on_ray
 from improvo.jobs.processes import Tick, run_here, run_in_processes
 from improvo.labeling.frames import FRAMES_FILE, FramesTable, pack_images, write_frames
-from improvo.labeling.quality import judge_frames, withhold_labels
+from improvo.labeling.labeler import run_and_label
 from improvo.labeling.store import DONE, FAILED, LabelStore, SequenceRecord, sequence_names
 from improvo.odometry.run_settings import RunSettings
-from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsWriter, read_points, read_tracks
 
 logger = logging.getLogger(__name__)
 
@@ -49,8 +48,12 @@ def label_sequences(
     """Label every recording that the store does not have yet.
 
     Args:
+        paths: of the recordings.
         folder: of the label store, see `improvo.labeling.store`.
+        settings: of the odometry and the labels.
         workers: sequences at a time, a process for each; one, or with `ray` as many as the cluster has cores, if None.
+        pack: whether to keep the frames beside the labels.
+        relabel: where the store was made with other settings, clear it instead of refusing.
         ray: address of a Ray cluster that does the work, see `improvo.jobs.on_ray`.
         on_record: is told each sequence as it is done, has failed, or was done before.
         on_frames: is told the number of further frames processed.
@@ -64,7 +67,7 @@ def label_sequences(
         OutputError, ConfigError: the store cannot be used, see `LabelStore`.
     """
     names = sequence_names(list(paths))
-    store = LabelStore(folder, _fingerprint(settings, pack), relabel)
+    store = LabelStore(folder, _fingerprint(settings, pack), relabel, type(settings))
     before = {record.name: record for record in store.records() if record.state == DONE}
     records = {name: before[name] for name in names if name in before}
     for name, record in records.items():
@@ -102,45 +105,25 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
         InputError: no frame got a pose, or no track is long enough to have a label.
         KeyboardInterrupt: it was interrupted; the folder is worth nothing.
     """
-    from improvo.odometry.run import run_odometry
     from improvo.sequences import open_sequence
 
     started = time.perf_counter()
     sequence = open_sequence(job.path, job.settings.sequence)
-    summary = run_odometry(sequence, job.folder, job.settings, "label", progress=lambda view: tick())
-    report = summary.report
+    labeled = run_and_label(sequence, job.folder, job.settings, "label", progress=lambda view: tick())
+    report, quality, trajectory = labeled.report, labeled.quality, labeled.trajectory
     if report["interrupted"]:
         raise KeyboardInterrupt
-    tracked = report["frames"]["tracked"]
-    if tracked == 0:
+    if labeled.tracked == 0:
         raise InputError(f"{job.path}: no frame got a pose: {_last_reason(report)}")
-
-    points, tracks = read_points(job.folder / POINTS_FILE), read_tracks(job.folder / TRACKS_FILE)
-    contradictions = [event["frame_index"] for event in report["events"] if event["kind"] == "contradiction"]
-    has_pose = summary.trajectory.valid
-    trust = judge_frames(
-        tracks,
-        points,
-        has_pose,
-        np.array(contradictions, np.int64),
-        job.settings.labels,
-        summary.trajectory.segment,
-    )
-    trusted = trust.trusted
-    if job.settings.labels.second_opinion.enabled:
-        points = withhold_labels(points, tracks, trusted, job.settings.labels)
-        with PointsWriter(job.folder / POINTS_FILE) as writer:
-            writer.write(points)
-    counts = points.counts()
+    counts = labeled.points.counts()
     if counts["stable"] + counts["unstable"] == 0:
-        raise InputError(f"{job.path}: no track has a label ({_why_none(trust.counts(), counts)})")
-    count = len(has_pose)
+        raise InputError(f"{job.path}: no track has a label ({_why_none(quality.counts(), counts)})")
     frames = FramesTable(
-        frame=np.arange(count),
-        index=np.array(report["frames"]["source_index"], np.int64),
-        time=summary.trajectory.times,
-        segment=summary.trajectory.segment,
-        trusted=trusted,
+        frame=np.arange(len(trajectory)),
+        source_index=np.array(report["frames"]["source_index"], np.int64),
+        time=trajectory.times,
+        segment=trajectory.segment,
+        trusted=quality.trusted,
     )
     write_frames(job.folder / FRAMES_FILE, frames)
     if job.pack:
@@ -152,13 +135,13 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
         name=job.name,
         path=str(job.path),
         state=DONE,
-        notes=_notes(report, trust.counts()),
+        notes=_notes(report, quality.counts()),
         format=sequence.format,
-        frames=count,
-        tracked=tracked,
-        trusted=int((trusted & has_pose).sum()),
+        frames=len(trajectory),
+        tracked=labeled.tracked,
+        trusted=int(quality.trusted.sum()),
         segments=len(report["segments"]),
-        tracks=len(points),
+        tracks=len(labeled.points),
         stable=counts["stable"],
         unstable=counts["unstable"],
         ignore=counts["ignore"],
@@ -208,7 +191,7 @@ def _last_reason(report: dict[str, Any]) -> str:
     return events[-1]["detail"] if events else "too little motion or texture"
 
 
-def _notes(report: dict[str, Any], trust: dict[str, int]) -> str:
+def _notes(report: dict[str, Any], quality: dict[str, int]) -> str:
     """What of a labelled sequence has no labels, and why, in one line."""
     notes = []
     if skipped := report["input"]["skipped"]:
@@ -220,14 +203,14 @@ def _notes(report: dict[str, Any], trust: dict[str, int]) -> str:
         starts = ", ".join(str(segment["first"]) for segment in report["segments"][1:])
         notes.append(f"tracking began anew at frame {starts}")
     reasons = {"high_error": "that fit badly", "little_parallax": "of little parallax", "contradicted": "in doubt"}
-    notes += [f"{trust[name]} {words}" for name, words in reasons.items() if trust[name]]
+    notes += [f"{quality[name]} {words}" for name, words in reasons.items() if quality[name]]
     return "; ".join(notes)
 
 
-def _why_none(trust: dict[str, int], counts: dict[str, int]) -> str:
+def _why_none(quality: dict[str, int], counts: dict[str, int]) -> str:
     if counts["withheld"]:
         return (
-            f"{counts['withheld']} withheld: of its frames {trust['little_parallax']} have too little parallax, "
-            f"{trust['high_error']} too large errors, {trust['no_pose']} no pose"
+            f"{counts['withheld']} withheld: of its frames {quality['little_parallax']} have too little parallax, "
+            f"{quality['high_error']} too large errors, {quality['no_pose']} no pose"
         )
     return "none is long enough, or all are in between stable and unstable"

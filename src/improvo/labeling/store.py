@@ -5,7 +5,7 @@
         settings.yaml           what the labels were made with; other settings are refused
         NAME/                   appears, complete, when the sequence is done
             tracks.parquet, points.parquet, trajectory.txt, map.ply, run.json
-            frames.parquet      position, index in the recording, time, segment, trusted
+            frames.parquet      frame, index in the recording, time, segment, trusted
             images-00000.parquet ...   with --pack: the frames themselves
             label.json          this sequence's row of the manifest
 
@@ -23,11 +23,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from improvo.config import first_difference
-from improvo.errors import ConfigError, InputError, OutputError
-from improvo.files import check_output_folder, make_output_folder, write_json, write_text, written_atomically
+from improvo.continuation import SettingsRecord
+from improvo.errors import InputError, OutputError
+from improvo.files import check_output_folder, make_output_folder, write_json, written_atomically
 
 MANIFEST_FILE, SETTINGS_FILE, RECORD_FILE = "manifest.parquet", "settings.yaml", "label.json"
 DONE, FAILED = "done", "failed"
@@ -46,13 +44,13 @@ class SequenceRecord:
     format: str = ""
     frames: int = 0  # processed
     tracked: int = 0  # with a pose
-    trusted: int = 0  # of those, by the second opinion
+    trusted: int = 0  # of those, by the quality gate
     segments: int = 0
     tracks: int = 0
     stable: int = 0
     unstable: int = 0
     ignore: int = 0
-    withheld: int = 0  # labels that the second opinion took away
+    withheld: int = 0  # labels that the quality gate took away
     packed: bool = False
     seconds: float = 0.0
 
@@ -64,41 +62,46 @@ class LabelStore:
         folder: made if need be.
         settings: everything that the labels depend on, as plain dictionaries.
         relabel: where the folder was made with other settings, clear it instead of refusing.
+        kind: class of the settings, see `SettingsRecord`.
 
     Raises:
         OutputError: the folder is not ours or cannot be written.
         ConfigError: it was made with other settings.
     """
 
-    def __init__(self, folder: Path, settings: dict[str, Any], relabel: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        settings: dict[str, Any],
+        relabel: bool = False,
+        kind: type | None = None,
+    ) -> None:
         check_output_folder(folder, _COMMAND)
         self.folder = folder
-        text = yaml.safe_dump(settings, sort_keys=False)
-        before = folder / SETTINGS_FILE
-        if before.is_file() and before.read_text() != text:
-            if not relabel:
-                changed = first_difference(yaml.safe_load(before.read_text()), settings)
-                raise ConfigError(f"{folder}: its labels were made with {changed}; use another folder, or --relabel")
-            for record in self.records():
-                if record.state == DONE:
-                    (folder / record.name).rename(self.partial(record.name))  # never a sequence that is half there
-                else:
-                    self._failure(record.name).unlink(missing_ok=True)
+        made_with = SettingsRecord(folder / SETTINGS_FILE, kind)
+        if not relabel:
+            made_with.check(settings, "use another folder, or --relabel")
+        elif made_with.difference(settings):
+            self._discard()
         make_output_folder(folder, _COMMAND)
         for leftover in folder.glob(".*.partial*"):
             if leftover.is_dir():
                 shutil.rmtree(leftover, ignore_errors=True)
             else:
                 leftover.unlink(missing_ok=True)
-        write_text(before, text)
+        made_with.write(settings)
+
+    def _discard(self) -> None:
+        """Clear the folder of all sequences; one is gone, or there as a whole."""
+        for record in self.records():
+            if record.state == DONE:
+                (self.folder / record.name).rename(self.partial(record.name))
+            else:
+                self._failure(record.name).unlink(missing_ok=True)
 
     def records(self) -> list[SequenceRecord]:
         """All sequences that are done or have failed, by name."""
         return read_records(self.folder)
-
-    def is_done(self, name: str) -> bool:
-        """Whether the sequence has labels."""
-        return (self.folder / name / RECORD_FILE).is_file()
 
     def partial(self, name: str) -> Path:
         """The folder to label the sequence in, empty; it does not exist yet."""

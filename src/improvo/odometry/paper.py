@@ -14,6 +14,7 @@ from improvo.geometry.camera import Camera
 from improvo.odometry.events import EventLog
 from improvo.odometry.health import HealthCheck
 from improvo.odometry.local_map import LocalMap
+from improvo.odometry.mapper import Mapper
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import TrackingState
@@ -22,16 +23,8 @@ from improvo.odometry.window import adjust
 from improvo.types import Float64
 
 
-class PaperMapper:
-    """Gives each view a pose as the paper does; a view that leaves the window is final.
-
-    Args:
-        camera: pinhole camera of the views.
-        settings: of the odometry.
-        descriptor_distance: the matching threshold on unit descriptors of this frontend.
-        result: takes over what is final.
-        events: is told what went wrong.
-    """
+class PaperMapper(Mapper):
+    """Gives each view a pose as the paper does; a view that leaves the window is final."""
 
     def __init__(
         self,
@@ -41,23 +34,13 @@ class PaperMapper:
         result: OdometryResult,
         events: EventLog,
     ) -> None:
-        self._camera = camera
-        self._settings = settings
-        self._descriptor_distance = descriptor_distance
-        self._result = result
-        self._events = events
-        self._map: LocalMap | None = None
+        super().__init__(camera, settings, descriptor_distance, result, events)
         self._window: list[View] = []
 
     @property
     def state(self) -> TrackingState:
         """TRACKING from the first frame on: every frame has a pose, and the map is never taken back."""
         return TrackingState.INITIALISING if self._map is None else TrackingState.TRACKING
-
-    @property
-    def local_map(self) -> LocalMap | None:
-        """The map of the running segment; None before the first frame."""
-        return self._map
 
     def track(self, view: View) -> None:
         """Previous pose, unit depths, bundle adjustment over the window."""

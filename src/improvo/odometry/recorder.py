@@ -1,4 +1,4 @@
-"""Streams finished tracks with their labels to disk while the odometry runs, so that memory stays bounded."""
+"""Writes finished tracks with the labels of the paper's rule while the odometry runs, so that memory stays bounded."""
 
 from __future__ import annotations
 
@@ -21,8 +21,15 @@ _FLUSH_EVERY = 200  # final frames
 class TrackRecorder:
     """Writes `tracks.parquet` and `points.parquet` of raw connect-the-dots tracks, with every link they had.
 
-    A track is written when it has ended and all frames that it passed are final. Use as a context manager: without an
-    error, the files appear when the block ends.
+    A track is written when it has ended and all frames that it passed are final, so the files are sorted by track only
+    within what was written at once (see `improvo.stability.tables`). The labels are those of the rule alone: the
+    quality gate comes afterwards (`improvo.labeling`). Use as a context manager: without an error, the files appear
+    when the block ends.
+
+    Args:
+        folder: for the two files.
+        camera: of the frames.
+        settings: of the rule.
     """
 
     def __init__(self, folder: Path, camera: Camera, settings: LabelSettings) -> None:
@@ -32,7 +39,7 @@ class TrackRecorder:
         self._points_writer = PointsWriter(folder / POINTS_FILE)
         self._pending: dict[int, FinalView] = {}  # final frames with tracks that are not written yet
         self._rest: _Rows | None = None  # rows of unfinished tracks from frames before those
-        self._next_position = 0  # all frames before it are final
+        self._next_frame = 0  # all frames before it are final
         self._poses: dict[int, tuple[Float64, int]] = {}  # of frames that unfinished tracks may refer to
         self.counts: Counter[str] = Counter()
 
@@ -64,22 +71,22 @@ class TrackRecorder:
 
     def _flush(self, everything: bool = False) -> None:
         """Write the tracks that ended in frames all of whose neighbours are final."""
-        while self._next_position in self._pending or (everything and self._pending):
-            view = self._pending.pop(self._next_position, None)
+        while self._next_frame in self._pending or (everything and self._pending):
+            view = self._pending.pop(self._next_frame, None)
             if view is not None:
                 self._take(view)
-            self._next_position += 1
+            self._next_frame += 1
         if self._rest is None or len(self._rest.frame) == 0:
             return
         rows = self._rest.sorted()
         last_frame = np.maximum.reduceat(rows.frame, rows.starts)
         # a chain has no gaps, so one that misses the newest final frame is over
-        over = np.ones(len(last_frame), bool) if everything else last_frame < self._next_position - 1
+        over = np.ones(len(last_frame), bool) if everything else last_frame < self._next_frame - 1
         finished = np.repeat(over, rows.lengths)
         self._write(rows.take(finished))
         self._rest = rows.take(~finished)
-        oldest = int(self._rest.frame.min()) if len(self._rest.frame) else self._next_position
-        self._poses = {position: pose for position, pose in self._poses.items() if position >= oldest}
+        oldest = int(self._rest.frame.min()) if len(self._rest.frame) else self._next_frame
+        self._poses = {frame: pose for frame, pose in self._poses.items() if frame >= oldest}
 
     def _take(self, view: FinalView) -> None:
         pose = se3.inverse(view.world_from_cam) if view.segment >= 0 else np.full((4, 4), np.nan)
@@ -95,9 +102,9 @@ class TrackRecorder:
         count = int(rows.frame.max()) + 1 - first
         cam_from_world = np.full((count, 4, 4), np.nan)
         segment = np.full(count, -1)
-        for position, (pose, number) in self._poses.items():
-            if 0 <= position - first < count:
-                cam_from_world[position - first], segment[position - first] = pose, number
+        for frame, (pose, number) in self._poses.items():
+            if 0 <= frame - first < count:
+                cam_from_world[frame - first], segment[frame - first] = pose, number
         tracks = Tracks(
             rows.frame - first, rows.track, rows.keypoints.astype(np.float32), rows.weight.astype(np.float32)
         )
@@ -112,7 +119,7 @@ class TrackRecorder:
 
 
 class _Rows:
-    """Observations as columns."""
+    """Observations as columns, one row each: (M,) frame, track, weight and point, (M, 2) keypoints."""
 
     def __init__(self, frame: Int64, track: Int64, keypoints: Float64, weight: Float64, point: Int64) -> None:
         self.frame, self.track, self.keypoints, self.weight, self.point = frame, track, keypoints, weight, point
@@ -128,7 +135,7 @@ class _Rows:
         return _Rows(*(np.concatenate(pair) for pair in zip(self._columns, other._columns, strict=True)))
 
     def sorted(self) -> _Rows:
-        """By track, then frame."""
+        """The rows by track, then frame."""
         return self.take(np.lexsort((self.frame, self.track)))
 
     @property

@@ -7,6 +7,7 @@ from improvo.odometry.events import EventLog
 from improvo.odometry.health import HealthCheck
 from improvo.odometry.initial_pair import InitFailure
 from improvo.odometry.local_map import LocalMap
+from improvo.odometry.mapper import Mapper
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.sliding_window import SlidingWindow
@@ -19,16 +20,8 @@ from improvo.types import Float64
 _FIRST_COOLDOWN = 3  # frames after a costly failure to start; it doubles with each further one
 
 
-class RobustMapper:
-    """Gives each view a pose; a view goes to the result when nothing can change it any more.
-
-    Args:
-        camera: pinhole camera of the views.
-        settings: of the odometry.
-        descriptor_distance: the matching threshold on unit descriptors of this frontend.
-        result: takes over what is final.
-        events: is told what went wrong.
-    """
+class RobustMapper(Mapper):
+    """Starts a map from two views, keeps it right, and starts another where it is lost (see `states.py`)."""
 
     def __init__(
         self,
@@ -38,17 +31,12 @@ class RobustMapper:
         result: OdometryResult,
         events: EventLog,
     ) -> None:
-        self._camera = camera
-        self._settings = settings
-        self._descriptor_distance = descriptor_distance
-        self._result = result
-        self._events = events
+        super().__init__(camera, settings, descriptor_distance, result, events)
         self._states = StateMachine()
         self._buffer: list[View] = []  # while INITIALISING: the initialisation buffer; while LOST: the lost frames
         self._cooldown = 0  # frames to wait before the next try to start
         self._costly_failures = 0  # since the last map
         self._worlds = 0  # maps started
-        self._map: LocalMap | None = None
         self._window = SlidingWindow(settings.window, camera.width)
         self._health = HealthCheck(camera, settings, descriptor_distance)
         self._provisional: list[View] = []  # all views of a provisional map with a pose, in order; none is final
@@ -57,11 +45,6 @@ class RobustMapper:
     def state(self) -> TrackingState:
         """What the mapper is doing."""
         return self._states.state
-
-    @property
-    def local_map(self) -> LocalMap | None:
-        """The map of the running segment; None while there is none."""
-        return self._map
 
     def track(self, view: View) -> None:
         """One frame: localise, triangulate, adjust the window, check, slide."""

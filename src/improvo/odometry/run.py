@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import platform
-import signal
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from threading import current_thread, main_thread
 from typing import Any
 
 import numpy as np
@@ -21,8 +18,9 @@ from improvo.config import to_dict
 from improvo.errors import InputError
 from improvo.files import make_output_folder, write_json
 from improvo.frontend import Frontend
-from improvo.frontend.registry import load_odometry_frontend
+from improvo.frontend.registry import frontend_from
 from improvo.geometry.trajectory_files import write_trajectory
+from improvo.jobs.interrupts import interrupts_wait
 from improvo.odometry.ahead import detected_ahead
 from improvo.odometry.map_file import write_map
 from improvo.odometry.recorder import TrackRecorder
@@ -74,9 +72,7 @@ def run_odometry(
         InputError: fewer than three readable frames.
         OutputError: the folder cannot be used.
     """
-    frontend = frontend or load_odometry_frontend(
-        settings.frontend.name, settings.frontend.max_keypoints, settings.frontend.least_stability
-    )
+    frontend = frontend or frontend_from(settings.frontend)
     visualizer = visualizer or NullVisualizer()
     if sequence.length is not None and sequence.length < _MIN_FRAMES:
         raise InputError(f"{sequence.path}: has {sequence.length} frames; odometry needs at least {_MIN_FRAMES}")
@@ -114,7 +110,7 @@ def _track_all(
     processed: list[int] = []
     try:
         for detected in detected_ahead(sequence, frontend, odometry.match):
-            with _interrupts_wait():
+            with interrupts_wait():
                 start = time.perf_counter()
                 tracked = odometry.track_matched(detected.matched, detected.frame.time)
                 seconds["track and adjust"] += time.perf_counter() - start
@@ -130,22 +126,6 @@ def _track_all(
     except KeyboardInterrupt:
         return processed, True
     return processed, False
-
-
-@contextmanager
-def _interrupts_wait() -> Iterator[None]:
-    """Ctrl-C takes effect at the end of the block. Within compiled code it would come out as a SystemError."""
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler or current_thread() is not main_thread():
-        yield
-        return
-    came: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, _: came.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    if came:
-        raise KeyboardInterrupt
 
 
 def _report(

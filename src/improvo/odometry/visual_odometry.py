@@ -11,6 +11,7 @@ import numpy as np
 from improvo.frontend import Frontend
 from improvo.geometry.camera import Camera
 from improvo.odometry.events import Event, EventLog
+from improvo.odometry.mapper import Mapper
 from improvo.odometry.paper import PaperMapper
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.robust import RobustMapper
@@ -81,7 +82,7 @@ class VisualOdometry:
         self._chain = TrackChain()
         self._newest: View | None = None
         self._matched_before: tuple[Float32, Float32] | None = None  # keypoints, unit descriptors of the last `match`
-        self._mapper: RobustMapper | PaperMapper | None = None
+        self._mapper: Mapper | None = None
         self._finished = False
 
     def __enter__(self) -> VisualOdometry:
@@ -124,7 +125,7 @@ class VisualOdometry:
         self._refuse_if_finished()
         view = self._extend_tracks(matched, time)
         if self._mapper is None:
-            mapper = RobustMapper if self._settings.mode == "robust" else PaperMapper
+            mapper: type[Mapper] = RobustMapper if self._settings.mode == "robust" else PaperMapper
             distance = self._max_distance(matched.features)
             self._mapper = mapper(self._camera, self._settings, distance, self._result, self._events)
         self._mapper.track(view)

@@ -44,7 +44,10 @@ def write_evaluation_page(folder: Path, path: Path) -> None:
     found = [name for name in EVALUATIONS if (folder / f"{name}.json").is_file()]
     if not found:
         raise InputError(f"{folder}: has no results of `improvo evaluate`; check the folder")
-    page = Page(EVALUATIONS[found[0]][0] if len(found) == 1 else "Evaluation", f"Results in {folder}.")
+    subjects = {name: _subject(folder / f"{name}.json") for name in found}
+    what = EVALUATIONS[found[0]][0] if len(found) == 1 else "Evaluation"
+    of = next((subject for subject in subjects.values() if subject), folder.name)
+    page = Page(f"{what}: {of}", "Results of `improvo evaluate`.")
     for name in found:
         title, meaning = EVALUATIONS[name]
         if len(found) > 1:
@@ -63,6 +66,21 @@ def _tables(page: Page, folder: Path, name: str) -> None:
         page.markdown((folder / f"{name}.md").read_text())
     except OSError:
         raise InputError(f"{folder / name}.md: is missing; run `improvo evaluate {name}` again") from None
+
+
+def _subject(path: Path) -> str:
+    """What was evaluated, in a few words: the recordings, or the estimate."""
+    try:
+        results = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); run the evaluation again") from None
+    entries = results.get("sequences") or results.get("sequence_rows") or []
+    found = [entry.get("name") or entry.get("sequence") for entry in entries if isinstance(entry, dict)]
+    names = list(dict.fromkeys(str(name) for name in found if name))
+    if names:
+        return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    estimate = Path(str(results.get("estimate", "")))
+    return estimate.parent.name if estimate.name == "trajectory.txt" else estimate.name
 
 
 _LONGEST = 200_000  # characters of a result that are worth embedding

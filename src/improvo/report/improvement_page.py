@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from improvo.report.charts import line_chart
-from improvo.report.page import Page
+from improvo.report.page import Page, plain
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,9 @@ def write_improvement_page(
     )
     for measure in measures:
         page.paragraph(f"{measure.name}: {measure.meaning}", note=True)
-    for position in range(max(len(entry.pictures) for entry in rounds)):
+    for place in range(max(len(entry.pictures) for entry in rounds)):
         for entry in (first, last) if last is not first else (first,):
-            for picture, caption in entry.pictures[position : position + 1]:
+            for picture, caption in entry.pictures[place : place + 1]:
                 page.picture(picture, f"{entry.name}: {caption}")
     if len(rounds) > 2:
         _curves(page, measures, rounds)
@@ -93,7 +93,7 @@ def write_improvement_page(
     page.heading("Time")
     for entry in rounds:
         if entry.seconds:
-            page.html(f"<h3>{_plain(entry.name)}</h3>")
+            page.html(f"<h3>{plain(entry.name)}</h3>")
             page.bars(("stage", "seconds"), [(name, value, f"{value:.1f}") for name, value in entry.seconds.items()])
     for entry in rounds:
         _losses(page, entry)
@@ -135,7 +135,7 @@ def _curves(page: Page, measures: Sequence[Measure], rounds: Sequence[Round]) ->
     for measure in measures[:4]:
         y = np.array([entry.values.get(measure.name, np.nan) for entry in rounds])
         chart = line_chart(x, y, f"{measure.name} over the rounds")
-        page.html(f"<figure>{chart}<figcaption>{_plain(measure.name)} over the rounds.</figcaption></figure>")
+        page.html(f"<figure>{chart}<figcaption>{plain(measure.name)} over the rounds.</figcaption></figure>")
 
 
 def _losses(page: Page, entry: Round) -> None:
@@ -146,10 +146,4 @@ def _losses(page: Page, entry: Round) -> None:
     page.heading(f"Training of {entry.name}")
     for name in names:
         chart = line_chart(np.array(entry.losses["step"]), np.array(entry.losses[name]), f"{name} over the steps")
-        page.html(f"<figure>{chart}<figcaption>Loss over the steps: {_plain(name)}.</figcaption></figure>")
-
-
-def _plain(text: str) -> str:
-    from html import escape
-
-    return escape(text)
+        page.html(f"<figure>{chart}<figcaption>Loss over the steps: {plain(name)}.</figcaption></figure>")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,13 @@ import numpy as np
 
 from improvo.labeling.store import DONE, read_records
 from improvo.odometry.run_folder import RunFolder
-from improvo.report.map_picture import draw_map
-from improvo.report.page import Page
+from improvo.report.map_picture import map_png
+from improvo.report.page import Page, plain
 from improvo.report.palettes import PALETTES, Palette
 from improvo.report.plain_words import warnings
 
 _MAX_MAPS = 12
+_MAX_NAMES = 3  # of recordings, in the title
 _COLUMNS = (
     "name", "state", "frames", "tracked", "trusted", "segments", "tracks", "stable", "unstable", "ignore", "withheld",
     "seconds",
@@ -32,7 +32,10 @@ def write_label_page(folder: Path, path: Path, palette: Palette = PALETTES["pape
     rows = [asdict(record) for record in read_records(folder)]
     runs = [RunFolder(run_json.parent) for run_json in sorted(folder.glob("[!.]*/run.json"))]
     totals = {name: sum(int(row[name]) for row in rows) for name in ("stable", "unstable", "ignore", "withheld")}
-    page = Page(f"Labels of {len(rows)} sequences", f"In {folder}.")
+    page = Page(
+        f"Labels of {_named([str(row['name']) for row in rows])}",
+        f"{len(rows)} sequences, labelled by `improvo label`.",
+    )
     page.tiles(
         [
             (f"{len(runs)} of {len(rows)}", "sequences with labels"),
@@ -45,22 +48,25 @@ def write_label_page(folder: Path, path: Path, palette: Palette = PALETTES["pape
     page.heading("Sequences")
     page.table(_COLUMNS, [[_words(row[name]) for name in _COLUMNS] for row in rows])
     page.paragraph(
-        "Withheld: tracks whose label the second opinion took away, because the odometry is not to be trusted where "
+        "Withheld: tracks whose label the quality gate took away, because the odometry is not to be trusted where "
         "they were seen.",
         note=True,
     )
     for run in runs[:_MAX_MAPS]:
-        page.html("<h3>" + run.name.replace("&", "&amp;").replace("<", "&lt;") + "</h3>")
+        page.html(f"<h3>{plain(run.name)}</h3>")
         page.warnings(
             warnings(run.report, np.zeros(0, np.int64), np.zeros(0), float("nan")),
-            "Every frame has a pose in one piece.",
+            "Every frame has a pose, in one segment.",
         )
         if len(run.trajectory):
-            with tempfile.TemporaryDirectory() as temporary:
-                picture = Path(temporary) / "map.png"
-                draw_map(run, picture, palette)
-                page.picture(picture, f"{run.name} from above")
+            page.picture(map_png(run, palette), f"{run.name} from above")
     page.write(path)
+
+
+def _named(names: list[str]) -> str:
+    """The recordings, or the first of them."""
+    shown = ", ".join(names[:_MAX_NAMES])
+    return shown if len(names) <= _MAX_NAMES else f"{shown} and {len(names) - _MAX_NAMES} more"
 
 
 def _words(value: Any) -> str:

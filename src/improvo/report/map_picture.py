@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,23 @@ from improvo.report.palettes import PALETTES, Palette
 from improvo.types import SparseMap
 
 _BACKGROUND = "#565b63"  # neither the paper's black (last window) nor its white (points)
-_LAST_POSES = 30  # N_last
+LAST_POSES = 30  # N_last
 
 
-def draw_map(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"], last_poses: int = _LAST_POSES) -> None:
-    """Write the picture as PNG: points white, the trajectory from blue to red over time, the last window black.
+def draw_map(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"], last_poses: int = LAST_POSES) -> None:
+    """Write the picture as PNG, see `map_png`.
+
+    Raises:
+        InputError: no frame of the run has a pose.
+        OutputError: the file cannot be written.
+    """
+    picture = map_png(run, palette, last_poses)
+    with written_atomically(path) as temporary:
+        temporary.write_bytes(picture)
+
+
+def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: int = LAST_POSES) -> bytes:
+    """A PNG: points white, the trajectory from blue to red over time, the last window black.
 
     Raises:
         InputError: no frame of the run has a pose.
@@ -83,8 +96,9 @@ def draw_map(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"], l
     axis.set_ylabel("ahead of the first camera", fontsize=8)
     axis.set_title(_title(run, len(shown), int((~inside).sum())), fontsize=10)
     _time_bar(figure, axis, palette, run.frames, len(last))
-    with written_atomically(path) as temporary:
-        figure.savefig(temporary, dpi=150, format="png", bbox_inches="tight", metadata={"Software": None})
+    png = io.BytesIO()
+    figure.savefig(png, dpi=150, format="png", bbox_inches="tight", metadata={"Software": None})
+    return png.getvalue()
 
 
 def trusted_points(sparse_map: SparseMap) -> NDArray[np.intp]:
@@ -100,7 +114,7 @@ def _title(run: RunFolder, points: int, outside: int) -> str:
         parts.append(f"{outside} far ones outside the picture")
     if len(segments) > 1:
         parts.append(f"{len(segments)} segments, each with its own scale, placed by guess")
-    return f"{run.name}, {run.report['frontend']}, seen from above\n" + "; ".join(parts)
+    return f"{run.name}, {Path(run.report['frontend']).name}, seen from above\n" + "; ".join(parts)
 
 
 def _figure_size(extent: NDArray[np.float64]) -> tuple[float, float]:

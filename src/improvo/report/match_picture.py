@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +63,7 @@ def paint_matches(
     panel_c.dots(carried.predicted[good], _fill(palette.stable, int(good.sum())), 1.8)
     return stacked(
         [
-            captioned(panel_a.rgb, f"{frontend.name}: {len(a)} points in A"),
+            captioned(panel_a.rgb, f"{Path(frontend.name).name}: {len(a)} points in A"),
             captioned(panel_b.rgb, f"{len(b)} points in B, {len(matches)} matches"),
             captioned(panel_c.rgb, f"{int(good.sum())} of {len(good)} within {_GOOD_ERROR:g} px; {carried.how}"),
         ],

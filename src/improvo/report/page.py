@@ -13,11 +13,19 @@ from typing import Any
 
 from improvo.files import write_text
 
+# an absolute path of this machine, of Unix or Windows; what is behind a letter, as in a/b or https://a/b, is none
+_ABSOLUTE = re.compile(r"(?<![\w./:])(?:/(?:[^/\s\"'`<>|]+/)+|[A-Za-z]:\\(?:[^\\\s\"'`<>|]+\\)+)(?=[^/\s])")
+
+
+def plain(text: str) -> str:
+    """Text as markup: escaped, and without the folders of this machine, since pages are sent to others."""
+    return escape(_ABSOLUTE.sub("", text))
+
 
 class Page:
     """Collects sections, then writes them.
 
-    Text arguments are plain text and are escaped; only `html` takes markup.
+    Text arguments are plain text: they are escaped, and absolute paths lose their folders; only `html` takes markup.
 
     Args:
         title: of the page.
@@ -26,7 +34,7 @@ class Page:
 
     def __init__(self, title: str, lead: str) -> None:
         self._title = title
-        self._body = [f"<h1>{escape(title)}</h1>", f'<p class="lead">{escape(lead)}</p>']
+        self._body = [f"<h1>{plain(title)}</h1>", f'<p class="lead">{plain(lead)}</p>']
         self._scripts: list[str] = []
 
     def html(self, markup: str) -> None:
@@ -35,30 +43,30 @@ class Page:
 
     def heading(self, text: str) -> None:
         """Begin a section."""
-        self._body.append(f"<h2>{escape(text)}</h2>")
+        self._body.append(f"<h2>{plain(text)}</h2>")
 
     def paragraph(self, text: str, note: bool = False) -> None:
         """A paragraph; `note` sets it small."""
         opening = '<p class="note">' if note else "<p>"
-        self._body.append(f"{opening}{escape(text)}</p>")
+        self._body.append(f"{opening}{plain(text)}</p>")
 
     def tiles(self, numbers: Sequence[tuple[str, str]]) -> None:
         """The main numbers: (value, meaning)."""
         tiles = "".join(
-            f'<div class="tile"><b>{escape(value)}</b><span>{escape(text)}</span></div>' for value, text in numbers
+            f'<div class="tile"><b>{plain(value)}</b><span>{plain(text)}</span></div>' for value, text in numbers
         )
         self._body.append(f'<div class="tiles">{tiles}</div>')
 
     def warnings(self, lines: Sequence[str], fine: str) -> None:
         """What to look out for, in plain words; `fine` is said where there is nothing."""
-        items = "".join(f"<li>{escape(line)}</li>" for line in lines) or f'<li class="fine">{escape(fine)}</li>'
+        items = "".join(f"<li>{plain(line)}</li>" for line in lines) or f'<li class="fine">{plain(fine)}</li>'
         self._body.append(f'<ul class="warnings">{items}</ul>')
 
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "") -> None:
         """A table; cells wrapped in ** are bold."""
         head = "".join(f"<th>{_cell(cell)}</th>" for cell in header)
         body = "".join("<tr>" + "".join(f"<td>{_cell(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-        below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+        below = f"<figcaption>{plain(caption)}</figcaption>" if caption else ""
         self._body.append(
             f'<figure><div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
             f"{below}</figure>"
@@ -68,11 +76,11 @@ class Page:
         """A table of (name, value, value in words) with a bar for each value."""
         largest = max((value for _, value, _ in rows), default=0.0) or 1.0
         body = "".join(
-            f'<tr><td>{escape(name)}</td><td>{escape(words)}</td><td class="bar">'
+            f'<tr><td>{plain(name)}</td><td>{plain(words)}</td><td class="bar">'
             f'<i style="width:{100 * value / largest:.1f}%"></i></td></tr>'
             for name, value, words in rows
         )
-        head = "".join(f"<th>{escape(cell)}</th>" for cell in (*header, ""))
+        head = "".join(f"<th>{plain(cell)}</th>" for cell in (*header, ""))
         self._body.append(
             f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
         )
@@ -88,7 +96,7 @@ class Page:
                 self.html("<ul>" + "".join(f"<li>{_cell(item[2:])}</li>" for item in items) + "</ul>")
             for line in rest:
                 if line.startswith("#"):
-                    self.html(f"<h3>{escape(line.lstrip('# '))}</h3>")
+                    self.html(f"<h3>{plain(line.lstrip('# '))}</h3>")
                 elif line.strip():
                     self.html(f"<p>{_cell(line)}</p>")
             rows = [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in table]
@@ -102,13 +110,12 @@ class Page:
         kind = "png" if content.startswith(b"\x89PNG") else "jpeg"
         source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
         self._body.append(
-            f'<figure><img src="{source}" alt="{escape(caption, quote=True)}"><figcaption>{escape(caption)}'
-            "</figcaption></figure>"
+            f'<figure><img src="{source}" alt="{plain(caption)}"><figcaption>{plain(caption)}</figcaption></figure>'
         )
 
     def details(self, summary: str, text: str) -> None:
         """Text that unfolds."""
-        self._body.append(f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>")
+        self._body.append(f"<details><summary>{plain(summary)}</summary><pre>{plain(text)}</pre></details>")
 
     def script(self, asset: str, data_id: str, data: Any) -> None:
         """A script of ours, and the data that it reads from the element `data_id`."""
@@ -125,7 +132,7 @@ class Page:
             path,
             '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
             '<meta name="viewport" content="width=device-width, initial-scale=1">'
-            f'<link rel="icon" href="data:,"><title>{escape(self._title)}</title><style>{_asset("page.css")}</style>'
+            f'<link rel="icon" href="data:,"><title>{plain(self._title)}</title><style>{_asset("page.css")}</style>'
             f"</head><body>\n{chr(10).join(self._body)}\n"
             f'<p class="note">Written by improvo {__version__}.</p>\n{scripts}</body></html>\n',
         )
@@ -136,4 +143,4 @@ def _asset(name: str) -> str:
 
 
 def _cell(text: str) -> str:
-    return re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", escape(text))
+    return re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", plain(text))

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.odometry.run_folder import RunFolder
-from improvo.report.map_picture import trusted_points
+from improvo.report.map_picture import LAST_POSES, trusted_points
 from improvo.report.overhead import overhead_axes, robust_limits
 from improvo.report.palettes import Palette
 from improvo.stability.rule import IGNORE
 from improvo.types import Float64, UInt8
 
 _MAX_POINTS = 40_000  # of a layer; more make the page heavy, not the picture clearer
-_LAST_POSES = 30  # N_last
 _JPEG_QUALITY = 55
 _NO_ERROR = 255
 _FLOW = 5  # frames behind each point
@@ -50,10 +49,10 @@ def scene_data(run: RunFolder, palette: Palette) -> dict[str, Any]:
             "labels": _layer(label_points, palette.label_colours(run.points.stability[label_rows])),
         },
         "poses": _base64(poses.astype("<f4")),
-        "positions": run.frame_indices.tolist(),
+        "frame_indices": run.frame_indices.tolist(),
         "segments": trajectory.segment.tolist(),
         "frames": run.frames,
-        "last": min(_LAST_POSES, max(len(trajectory) - 1, 0)),
+        "last": min(LAST_POSES, max(len(trajectory) - 1, 0)),
         "centre": centre,
         "radius": float(np.linalg.norm(high - low) / 2),
         "half_width": run.camera.width / 2 / run.camera.fx,
@@ -63,14 +62,14 @@ def scene_data(run: RunFolder, palette: Palette) -> dict[str, Any]:
 
 
 def frames_data(
-    run: RunFolder, positions: list[int], palette: Palette, width: int, old: int = 30, large_error: float = 3.0
+    run: RunFolder, frames: list[int], palette: Palette, width: int, old: int = 30, large_error: float = 3.0
 ) -> tuple[dict[str, Any], Float64]:
     """The frames of the slider with their tracks, and the mean brightness (N,) of each in grey values.
 
     Frames that the recording no longer gives are left out.
 
     Args:
-        positions: of the frames.
+        frames: which of the run's.
         palette: of what is drawn over them.
         width: of the pictures in pixels.
         old: age in frames of the last colour.
@@ -82,28 +81,28 @@ def frames_data(
     import cv2
 
     assert len(run.sequence) > 0  # opened here, so that a recording that is gone is an error and not no frames
-    frames, brightness = [], []
-    for position in positions:
+    shown, brightness = [], []
+    for frame in frames:
         try:
-            image = run.image(position)
+            image = run.image(frame)
         except InputError:
             continue
         height = round(image.shape[0] * width / image.shape[1])
         small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
         _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-        seen = run.observations(position)
-        frames.append(
+        seen = run.observations(frame)
+        shown.append(
             {
-                "position": position,
+                "frame": frame,
                 "jpeg": base64.b64encode(jpeg.tobytes()).decode(),
-                "points": _base64(_packed_points(run, position, old, large_error)),
-                "caption": f"frame {position} of {run.frames}: {int((seen.age > 0).sum())} tracks, "
+                "points": _base64(_packed_points(run, frame, old, large_error)),
+                "caption": f"frame {frame} of {run.frames}: {int((seen.age > 0).sum())} tracks, "
                 + (f"median error {np.nanmedian(seen.error):.2f} px" if np.isfinite(seen.error).any() else "no pose"),
             }
         )
         brightness.append(float(image.mean()))
     data = {
-        "frames": frames,
+        "frames": shown,
         "width": run.camera.width,
         "young": int(255 * 2 / old),  # ages are stored as shares of `old`
         "ramp": palette.ramp_strip(256).reshape(-1).tolist(),
@@ -112,15 +111,15 @@ def frames_data(
     return data, np.array(brightness)
 
 
-def _packed_points(run: RunFolder, position: int, old: int, large_error: float) -> NDArray[np.void]:
+def _packed_points(run: RunFolder, frame: int, old: int, large_error: float) -> NDArray[np.void]:
     """The tracks of a frame: where they are and were, in 1/16 px, and age, error and label as bytes."""
-    seen = run.observations(position)
+    seen = run.observations(frame)
     row = np.dtype([("now", "<u2", 2), ("before", "<u2", 2), ("age", "u1"), ("error", "u1"), ("label", "u1")])
     packed = np.zeros(len(seen), row)
     before = seen.keypoints.copy()
     followed = np.ones(len(seen), np.bool_)
-    for frame in range(position - 1, max(position - _FLOW, 0) - 1, -1):
-        rows = run.rows_of(frame, seen.track)
+    for earlier_frame in range(frame - 1, max(frame - _FLOW, 0) - 1, -1):
+        rows = run.rows_of(earlier_frame, seen.track)
         earlier = run.tracks.keypoints[rows].astype(np.float64)
         # a line across the picture, where a link jumps, says less than what lies after the jump alone
         followed &= (rows >= 0) & (np.linalg.norm(earlier - before, axis=1) < _JUMP_SHARE * run.camera.width)
@@ -136,7 +135,7 @@ def _packed_points(run: RunFolder, position: int, old: int, large_error: float) 
 
 def per_frame(run: RunFolder, value: Callable[[NDArray[np.int64]], float]) -> Float64:
     """(frames,) of `value` on the rows of `run.tracks` that belong to each frame."""
-    return np.array([value(run.rows_at(position)) for position in range(run.frames)])
+    return np.array([value(run.rows_at(frame)) for frame in range(run.frames)])
 
 
 def _layer(xyz: Float64, rgb: UInt8) -> dict[str, str]:

@@ -11,12 +11,12 @@ from improvo.types import Float64, Int64
 _DARK = 25.0  # mean grey value below which features become rare
 
 
-def warnings(report: dict[str, Any], positions: Int64, brightness: Float64, median_error: float) -> list[str]:
+def warnings(report: dict[str, Any], shown: Int64, brightness: Float64, median_error: float) -> list[str]:
     """One line for each thing that is wrong or doubtful, the gravest first.
 
     Args:
         report: the content of run.json.
-        positions: (N,) frames whose brightness is known.
+        shown: (N,) frames whose brightness is known.
         brightness: (N,) mean grey value.
         median_error: pixels, over all observations; NaN without any.
     """
@@ -34,15 +34,15 @@ def warnings(report: dict[str, Any], positions: Int64, brightness: Float64, medi
     if len(segments) > 1:
         starts = ", ".join(str(segment["first"]) for segment in segments[1:])
         lines.append(
-            f"The trajectory is in {len(segments)} pieces (new ones start at frames {starts}). Each has its own scale, "
-            "and where they stand to each other is a guess."
+            f"The trajectory is in {len(segments)} segments (new ones start at frames {starts}). Each has its own "
+            "scale, and where they stand to each other is a guess."
         )
     skipped = report["input"]["skipped"]
     if skipped:
         first = skipped[0]
         lines.append(f"{len(skipped)} frames could not be read, the first is {first['source']}: {first['reason']}.")
     lines += [f"About the recording: {note}." for note in report["input"]["notes"]]
-    dark = positions[brightness < _DARK]
+    dark = shown[brightness < _DARK]
     if len(dark):
         lines.append(f"Dark frames (mean grey value under {_DARK:g} of 255): {ranges(dark.tolist())}.")
     if np.isfinite(median_error) and median_error > 1.5:
@@ -64,7 +64,7 @@ def _events(report: dict[str, Any]) -> list[str]:
     if waiting and report["frames"]["lost"]:  # frames that only waited get their pose once the map has begun
         last = waiting[-1]
         lines.append(f"The map could not begin; the last reason, at frame {last['frame_index']}: {last['detail']}.")
-    by_kind.pop("segment", None)  # said by the number of pieces
+    by_kind.pop("segment", None)  # said by the number of segments
     for kind, events in by_kind.items():
         lines.append(f"{kind.capitalize()} at frame {events[0]['frame_index']}: {events[0]['detail']}.")
     return lines

@@ -100,7 +100,7 @@ def show_run(
     """
     recording = _Recording(save)
     recording.open(run.camera)
-    row_of_position = {int(position): row for row, position in enumerate(run.frame_indices)}
+    row_of_frame = {int(frame): row for row, frame in enumerate(run.frame_indices)}
     times = run.sequence.times if images else np.zeros(0)
     labelled = np.flatnonzero((run.points.stability != IGNORE) & np.isfinite(run.points.xyz).all(axis=1))
     recording.points(
@@ -108,12 +108,12 @@ def show_run(
     )
     recording.points(run.map.xyz, np.full((len(run.map), 3), 200, np.uint8), static=True)
     recording.trajectory(run.trajectory.camera_centers, palette, static=True)
-    for position in range(run.frames):
-        row = row_of_position.get(position)
-        recording.at(position, float(run.trajectory.times[row]) if row is not None else _time(times, run, position))
+    for frame in range(run.frames):
+        row = row_of_frame.get(frame)
+        recording.at(frame, float(run.trajectory.times[row]) if row is not None else _time(times, run, frame))
         if images:
-            recording.image(run.image(position))
-        seen = run.observations(position)
+            recording.image(run.image(frame))
+        seen = run.observations(frame)
         recording.keypoints(seen.keypoints, palette.label_colours(seen.stability))
         recording.scalar("plots/tracks", float((seen.age > 0).sum()))
         if np.isfinite(seen.error).any():
@@ -123,10 +123,10 @@ def show_run(
     recording.close()
 
 
-def _time(times: Float64, run: RunFolder, position: int) -> float:
+def _time(times: Float64, run: RunFolder, frame: int) -> float:
     """Seconds of a frame without a pose."""
-    rows = np.flatnonzero(run.sequence.indices == run.source_index[position]) if len(times) else np.zeros(0, np.int64)
-    return float(times[rows[0]]) if len(rows) else float(position)
+    rows = np.flatnonzero(run.sequence.indices == run.source_index[frame]) if len(times) else np.zeros(0, np.int64)
+    return float(times[rows[0]]) if len(rows) else float(frame)
 
 
 class _Recording:
@@ -164,9 +164,9 @@ class _Recording:
     def _log(self, path: str, what: Any, static: bool = False) -> None:
         self._stream.log(path, what, static=static)
 
-    def at(self, position: int, seconds: float) -> None:
+    def at(self, frame: int, seconds: float) -> None:
         """What follows belongs to this frame."""
-        self._stream.set_time("frame", sequence=position)
+        self._stream.set_time("frame", sequence=frame)
         self._stream.set_time("time", duration=seconds)
 
     def image(self, image: UInt8) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.odometry.run_folder import RunFolder
 from improvo.report.charts import line_chart
-from improvo.report.map_picture import draw_map
+from improvo.report.map_picture import map_png
 from improvo.report.page import Page
 from improvo.report.page_data import frames_data, per_frame, scene_data
 from improvo.report.palettes import PALETTES, Palette
@@ -58,7 +57,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
         missing = ""
     except InputError as error:
         data, brightness, missing = {"frames": []}, np.zeros(0), str(error)
-    shown = np.array([frame["position"] for frame in data["frames"]], np.int64)
+    shown = np.array([frame["frame"] for frame in data["frames"]], np.int64)
     known = run.tracks.error[np.isfinite(run.tracks.error)]
     median_error = float(np.median(known)) if len(known) else float("nan")
 
@@ -71,7 +70,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
     page.tiles(
         [
             (f"{frames['tracked']} of {frames['processed']}", "frames with a pose"),
-            (str(len(report["segments"])), "pieces (1 is best)"),
+            (str(len(report["segments"])), "segments (1 is best)"),
             (f"{report['points']:,}", "map points"),
             (f"{median_error:.2f} px" if np.isfinite(median_error) else "-", "median re-projection error"),
             (f"{report['frames_per_second']:g}", "frames per second"),
@@ -79,7 +78,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
         ]
     )
     page.heading("What to look out for")
-    page.warnings(warnings(report, shown, brightness, median_error), "Nothing: every frame has a pose in one piece.")
+    page.warnings(warnings(report, shown, brightness, median_error), "Nothing: every frame has a pose, in one segment.")
     if len(run.trajectory):
         _map_section(page, run, palette)
     _frames_section(page, run, data, palette, missing)
@@ -93,15 +92,11 @@ def _map_section(page: Page, run: RunFolder, palette: Palette) -> None:
     page.heading("Map and trajectory")
     page.html(_SCENE.format(gradient=_gradient(palette)))
     page.script("scene.js", "scene-data", scene_data(run, palette))
-    with tempfile.TemporaryDirectory() as folder:
-        picture = Path(folder) / "map.png"
-        draw_map(run, picture, palette)
-        page.picture(
-            picture,
-            "Seen from above: points white, the trajectory from blue to red over time, the last window black."
-            if palette.name == "paper"
-            else "Seen from above: points white, the trajectory from dark to bright over time, the last window black.",
-        )
+    colours = "from blue to red" if palette.name == "paper" else "from dark to bright"
+    page.picture(
+        map_png(run, palette),
+        f"Seen from above: points white, the trajectory {colours} over time, the last window black.",
+    )
 
 
 def _frames_section(page: Page, run: RunFolder, data: dict[str, object], palette: Palette, missing: str) -> None:

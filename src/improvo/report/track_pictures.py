@@ -15,7 +15,7 @@ from improvo.types import Float32, Int64, UInt8
 
 _JUMP_SHARE = 0.03  # of the image width; shorter links are never called a jump
 
-FramePainter = Callable[[RunFolder, int], UInt8]  # (run, position) -> RGB picture
+FramePainter = Callable[[RunFolder, int], UInt8]  # (run, frame) -> RGB picture
 
 
 @dataclass(frozen=True)
@@ -30,70 +30,70 @@ class TrackPictureSettings:
     width: int = 1280  # small frames are enlarged to about this
 
 
-def paint_tracks(run: RunFolder, position: int, settings: TrackPictureSettings | None = None) -> UInt8:
+def paint_tracks(run: RunFolder, frame: int, settings: TrackPictureSettings | None = None) -> UInt8:
     """Sparse flow: where each track came from in the last frames, coloured by its age (row a)."""
     settings = settings or TrackPictureSettings()
-    canvas = Canvas(run.image(position), width=settings.width)
-    seen = run.observations(position)
+    canvas = Canvas(run.image(frame), width=settings.width)
+    seen = run.observations(frame)
     colours = settings.palette.ramp_colours(seen.age, 1, settings.old)
     rows = np.argsort(seen.age, kind="stable")  # old tracks on top
     young, grown = rows[seen.age[rows] < settings.min_age], rows[seen.age[rows] >= settings.min_age]
     canvas.dots(seen.keypoints[young], colours[young], 0.9)
-    _draw_tails(canvas, run, position, settings.tail, seen.track[grown], colours[grown])
+    _draw_tails(canvas, run, frame, settings.tail, seen.track[grown], colours[grown])
     canvas.dots(seen.keypoints[grown], colours[grown], 1.7)
     median = np.median(seen.age[grown]) if len(grown) else 0
     return canvas.with_caption(
-        f"frame {position}: {len(grown)} tracks of {settings.min_age}+ frames with their last {settings.tail} frames "
+        f"frame {frame}: {len(grown)} tracks of {settings.min_age}+ frames with their last {settings.tail} frames "
         f"of flow, {len(young)} younger (dots); median age {median:.0f}; jumps are faint",
         (settings.palette.ramp_strip(), "new", f"{settings.old}+ frames"),
     )
 
 
-def paint_residuals(run: RunFolder, position: int, settings: TrackPictureSettings | None = None) -> UInt8:
+def paint_residuals(run: RunFolder, frame: int, settings: TrackPictureSettings | None = None) -> UInt8:
     """Re-projection errors under the final poses, blue low to red high (row c); points without one are left out."""
     settings = settings or TrackPictureSettings()
-    canvas = Canvas(run.image(position), width=settings.width)
-    seen = run.observations(position)
+    canvas = Canvas(run.image(frame), width=settings.width)
+    seen = run.observations(frame)
     rows = np.flatnonzero(np.isfinite(seen.error))
     rows = rows[np.argsort(seen.error[rows], kind="stable")]  # large errors on top
     canvas.dots(seen.keypoints[rows], settings.palette.ramp_colours(seen.error[rows], 0, settings.large_error), 2.2)
     error = seen.error[rows]
     middle = f"median {np.median(error):.2f} px, {(error > settings.large_error).mean():.0%} over" if len(rows) else "-"
     return canvas.with_caption(
-        f"frame {position}: re-projection error of {len(rows)} points; {middle} {settings.large_error:g} px",
+        f"frame {frame}: re-projection error of {len(rows)} points; {middle} {settings.large_error:g} px",
         (settings.palette.ramp_strip(), "0", f"{settings.large_error:g}+ px"),
     )
 
 
-def paint_labels(run: RunFolder, position: int, settings: TrackPictureSettings | None = None) -> UInt8:
+def paint_labels(run: RunFolder, frame: int, settings: TrackPictureSettings | None = None) -> UInt8:
     """Stability labels: green stable, red unstable, blue ignored (row d), with each track's flow."""
     settings = settings or TrackPictureSettings()
-    canvas = Canvas(run.image(position), width=settings.width)
-    seen = run.observations(position)
+    canvas = Canvas(run.image(frame), width=settings.width)
+    seen = run.observations(frame)
     colours = settings.palette.label_colours(seen.stability)
     for code, radius in ((IGNORE, 1.2), (STABLE, 2.0), (UNSTABLE, 2.6)):  # what matters most on top
         rows = np.flatnonzero(seen.stability == code)
         if code != IGNORE:
-            _draw_tails(canvas, run, position, settings.tail, seen.track[rows], colours[rows])
+            _draw_tails(canvas, run, frame, settings.tail, seen.track[rows], colours[rows])
         canvas.dots(seen.keypoints[rows], colours[rows], radius)
     counts = np.bincount(seen.stability, minlength=3)
     words = {"paper": ("green", "red", "blue"), "colour-blind": ("green", "orange", "blue")}[settings.palette.name]
     return canvas.with_caption(
-        f"frame {position}: {counts[STABLE]} stable ({words[0]}), {counts[UNSTABLE]} unstable ({words[1]}), "
+        f"frame {frame}: {counts[STABLE]} stable ({words[0]}), {counts[UNSTABLE]} unstable ({words[1]}), "
         f"{counts[IGNORE]} ignored ({words[2]})"
     )
 
 
-def _draw_tails(canvas: Canvas, run: RunFolder, position: int, tail: int, tracks: Int64, colours: UInt8) -> None:
+def _draw_tails(canvas: Canvas, run: RunFolder, frame: int, tail: int, tracks: Int64, colours: UInt8) -> None:
     """The flow of the given tracks through the last `tail` frames; links that jump are drawn faintly.
 
     The tracks are raw: a link to something else stays in them, and would otherwise be all that one sees.
     """
     links: list[tuple[Float32, Float32, UInt8]] = []
     keypoints = run.tracks.keypoints
-    later = run.rows_of(position, tracks)
-    for frame in range(position - 1, max(position - tail, 0) - 1, -1):
-        earlier = run.rows_of(frame, tracks)
+    later = run.rows_of(frame, tracks)
+    for before in range(frame - 1, max(frame - tail, 0) - 1, -1):
+        earlier = run.rows_of(before, tracks)
         both = (later >= 0) & (earlier >= 0)
         if not both.any():
             break

@@ -1,0 +1,1 @@
+"""The paper's stability rule on tracks (`rule`), and the tables that keep tracks and labels (`tables`)."""

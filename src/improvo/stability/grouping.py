@@ -17,7 +17,16 @@ def rows_of(ids: Int64, wanted: Int64) -> Int64:
 
 
 def medians(group: Int64, values: NDArray[Any], groups: int) -> Float64:
-    """Median (groups,) of the finite values (M,) of each group 0..groups-1, NaN for one without any."""
+    """Median of the finite values of each group; of two middle values, their mean.
+
+    Args:
+        group: (M,) number of the group that each value belongs to.
+        values: (M,)
+        groups: how many there are; they are numbered from 0.
+
+    Returns:
+        (groups,) NaN for a group without a finite value.
+    """
     known = np.isfinite(values)
     order = np.lexsort((values[known], group[known]))
     ordered, group = values[known][order].astype(np.float64), group[known][order]

@@ -32,7 +32,7 @@ class TrackLabels:
     max_error: Float64  # (T,) pixels
     stability: NDArray[np.int8]  # (T,) IGNORE, UNSTABLE or STABLE
     parallax_deg: Float64  # (T,) largest angle between two rays from the point to cameras that saw it
-    distrusted: NDArray[np.bool_]  # (T,) a label was withheld by the second opinion (`improvo.labeling.quality`)
+    withheld: NDArray[np.bool_]  # (T,) the quality gate took its label away (`improvo.labeling.quality`); here none
     errors: Float64  # (M,) pixels, per observation; NaN where it has none
 
     def __len__(self) -> int:
@@ -42,11 +42,21 @@ class TrackLabels:
         """Number of tracks per label, and of labels withheld."""
         by_code = np.bincount(self.stability, minlength=len(STABILITY_NAMES))
         names = {name: int(by_code[code]) for code, name in enumerate(STABILITY_NAMES)}
-        return {**names, "withheld": int(self.distrusted.sum())}
+        return {**names, "withheld": int(self.withheld.sum())}
 
 
 def classify(observations: Int64, mean_error: Float64, max_error: Float64, settings: LabelSettings) -> NDArray[np.int8]:
-    """The rule alone (paper, eq. stability): codes (T,)."""
+    """The rule alone (paper, eq. stability).
+
+    Args:
+        observations: (T,) number of observations T_j of each track.
+        mean_error: (T,) pixels; NaN for a track without a point.
+        max_error: (T,) pixels.
+        settings: the three thresholds.
+
+    Returns:
+        (T,) STABLE, UNSTABLE or IGNORE.
+    """
     long_enough = observations >= settings.min_observations
     stable = long_enough & (mean_error <= settings.stable_mean_error)
     unstable = long_enough & ~stable & (max_error >= settings.unstable_max_error)
@@ -69,6 +79,7 @@ def label_stability(
         cam_from_world: (F, 4, 4) final poses by `tracks.frame`; NaN where there is none.
         segment: (F,) segment of each pose, -1 where there is none; a track is judged in the one that saw most of it.
         K: (3, 3).
+        settings: the rule, and how a track's point is found.
         point: (T,) map point of each track in the order in which the tracks appear, -1 where none; for the record.
         point_xyz: (T, 3) where the odometry already has the point, NaN where it is to be solved here.
 
@@ -113,7 +124,7 @@ def label_stability(
         max_error=max_error,
         stability=stability,
         parallax_deg=solved.parallax_deg,
-        distrusted=np.zeros(count, np.bool_),
+        withheld=np.zeros(count, np.bool_),
         errors=errors,
     )
 

@@ -9,8 +9,8 @@ from improvo.errors import ConfigError
 
 
 @dataclass(frozen=True)
-class TrustSettings:
-    """The second opinion: where the odometry is not to be trusted, its labels are withheld (docs/labels.md)."""
+class LabelQualitySettings:
+    """The quality gate: where the odometry is not to be trusted, its labels are withheld (docs/labels.md)."""
 
     enabled: bool = True
     max_median_error: float = 2.0  # pixels; a frame whose long tracks fit worse is not trusted
@@ -34,7 +34,7 @@ class LabelSettings:
     unstable_max_error: float = 5.0  # pixels; else unstable if the largest error is not below it
     loss: Literal["geman_mcclure", "huber"] = "geman_mcclure"  # of the robust solve
     loss_width: float = 2.0  # pixels
-    second_opinion: TrustSettings = field(default_factory=TrustSettings)  # beyond the paper
+    quality: LabelQualitySettings = field(default_factory=LabelQualitySettings)  # beyond the paper
 
     def __post_init__(self) -> None:
         if self.min_observations < 2:

@@ -2,15 +2,19 @@
 
 One file per sequence and kind, never one per image. Rows are written in groups while the odometry runs, to a temporary
 name that becomes the real one when the writer closes, so that a reader never sees half a file.
+
+Order of rows. A track is written when it has ended, so a file is sorted by track within each group that was written,
+and not as a whole: a long track comes after shorter ones that began later. The readers sort: what `read_points` returns
+is sorted by track, what `read_tracks` returns by track, then frame.
 """
 
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,18 +48,18 @@ def points_schema() -> pa.Schema:
             ("stability", pa.dictionary(pa.int8(), pa.string())),
             ("segment", pa.int32()),  # x, y, z are in this segment's world
             ("parallax", pa.float32()),  # degrees, largest angle between two of its rays
-            ("withheld", pa.bool_()),  # the second opinion took its label away
+            ("withheld", pa.bool_()),  # the quality gate took its label away
         ]
     )
 
 
 def tracks_schema() -> pa.Schema:
-    """One row per observation; the rows of a track stand together, in the order of frames."""
+    """One row per observation; the rows of a track stand together, in the order of frames. Tracks come in any order."""
     import pyarrow as pa
 
     return pa.schema(
         [
-            ("frame", pa.int32()),  # position in the processed sequence
+            ("frame", pa.int32()),  # index in the processed sequence
             ("track", pa.int64()),
             ("u", pa.float32()),  # pixels of the processed frames
             ("v", pa.float32()),
@@ -127,8 +131,6 @@ class PointsWriter(_TableWriter):
         """Append one row per track."""
         import pyarrow as pa
 
-        withheld = labels.distrusted if isinstance(labels, TrackLabels) else labels.withheld
-
         stability = pa.DictionaryArray.from_arrays(pa.array(labels.stability, pa.int8()), list(STABILITY_NAMES))
         self._append(
             [
@@ -141,7 +143,7 @@ class PointsWriter(_TableWriter):
                 stability,
                 labels.segment.astype(np.int32),
                 labels.parallax_deg.astype(np.float32),
-                withheld,
+                labels.withheld,
             ]
         )
 
@@ -153,7 +155,15 @@ class TracksWriter(_TableWriter):
         super().__init__(path, tracks_schema())
 
     def write(self, frame: Int64, track: Int64, keypoints: Float32, weight: Float32, error: Float64) -> None:
-        """Append whole tracks, one row per observation: (M,), (M,), (M, 2), (M,), (M,)."""
+        """Append whole tracks, one row per observation, sorted by track, then frame.
+
+        Args:
+            frame: (M,) index in the processed sequence.
+            track: (M,) track id; no other call has rows of these tracks.
+            keypoints: (M, 2) pixels.
+            weight: (M,) observation confidence w_ij.
+            error: (M,) pixels under the final poses; NaN where there is none.
+        """
         keypoints = np.asarray(keypoints, np.float32)
         self._append(
             [
@@ -169,7 +179,7 @@ class TracksWriter(_TableWriter):
 
 @dataclass(frozen=True)
 class PointsTable:
-    """`points.parquet` in memory."""
+    """`points.parquet` in memory; as `read_points` returns it, sorted by track."""
 
     track: Int64  # (T,)
     point: Int64  # (T,) -1 where the map has none
@@ -180,10 +190,16 @@ class PointsTable:
     stability: NDArray[np.int8]  # (T,) codes of `improvo.stability.rule`
     segment: Int64  # (T,)
     parallax_deg: Float32  # (T,)
-    withheld: NDArray[np.bool_]  # (T,) the second opinion took its label away
+    withheld: NDArray[np.bool_]  # (T,) the quality gate took its label away
 
     def __len__(self) -> int:
         return len(self.track)
+
+    def in_order(self) -> PointsTable:
+        """The rows sorted by track; this table itself where they are."""
+        if (np.diff(self.track) > 0).all():
+            return self
+        return _rows(self, np.argsort(self.track, kind="stable"))
 
     def counts(self) -> dict[str, int]:
         """Number of tracks per label, and of labels withheld."""
@@ -194,7 +210,7 @@ class PointsTable:
 
 @dataclass(frozen=True)
 class TracksTable:
-    """`tracks.parquet` in memory."""
+    """`tracks.parquet` in memory; as `read_tracks` returns it, sorted by track, then frame."""
 
     frame: Int64  # (M,)
     track: Int64  # (M,)
@@ -205,9 +221,24 @@ class TracksTable:
     def __len__(self) -> int:
         return len(self.frame)
 
+    def in_order(self) -> TracksTable:
+        """The rows sorted by track, then frame; this table itself where they are."""
+        step = np.diff(self.track)
+        if ((step > 0) | ((step == 0) & (np.diff(self.frame) > 0))).all():
+            return self
+        return _rows(self, np.lexsort((self.frame, self.track)))
+
+
+Table = TypeVar("Table", PointsTable, TracksTable)
+
+
+def _rows(table: Table, rows: Int64) -> Table:
+    """The table with these rows, in this order."""
+    return type(table)(**{field.name: getattr(table, field.name)[rows] for field in fields(table)})
+
 
 def read_points(path: Path) -> PointsTable:
-    """Read `points.parquet`.
+    """Read `points.parquet`, sorted by track.
 
     Raises:
         InputError: missing, no Parquet, or without the columns that `improvo run` and `improvo label` write.
@@ -230,11 +261,11 @@ def read_points(path: Path) -> PointsTable:
         table["segment"].to_numpy().astype(np.int64),
         table["parallax"].to_numpy(),
         table["withheld"].to_numpy().astype(np.bool_),
-    )
+    ).in_order()
 
 
 def read_tracks(path: Path) -> TracksTable:
-    """Read `tracks.parquet`.
+    """Read `tracks.parquet`, sorted by track, then frame.
 
     Raises:
         InputError: missing, no Parquet, or without the columns that `improvo run` and `improvo label` write.
@@ -246,7 +277,7 @@ def read_tracks(path: Path) -> TracksTable:
         np.stack([table["u"].to_numpy(), table["v"].to_numpy()], axis=1),
         table["weight"].to_numpy(),
         table["error"].to_numpy(),
-    )
+    ).in_order()
 
 
 def _read(path: Path, schema: pa.Schema) -> pa.Table:

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
-from tqdm import tqdm
 
+from improvo import terminal
 from improvo.frontend.superpoint import SuperPoint, heat_map
 from improvo.training.labels import Consensus, PointLabels
 from improvo.training.pictures import Pictures
@@ -77,12 +77,12 @@ def adapt(
 ) -> list[list[PointLabels]]:
     """Labels of every picture of every source, by the agreement of `detect` over random views."""
     result = []
-    with tqdm(total=len(pictures), desc="homographic adaptation", unit="picture", disable=not progress) as bar:
+    with terminal.progress("homographic adaptation", "picture", len(pictures), progress) as shown:
         for s, source in enumerate(pictures.sources):
             labels = []
             for p, picture in enumerate(source.pictures):
                 labels.append(_adapt_one(picture, detect, settings, views, np.random.default_rng([seed, s, p])))
-                bar.update()
+                shown.advance()
             result.append(labels)
     return result
 

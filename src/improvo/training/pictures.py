@@ -8,8 +8,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
+from improvo import terminal
 from improvo.errors import InputError
 from improvo.types import Float64, UInt8
 
@@ -64,7 +64,7 @@ def load_pictures(paths: Iterable[str], longer_side: int = 320, progress: bool =
         InputError: a source without a readable picture, or a weight that is not a positive number.
     """
     sources, skipped = [], []
-    for text in tqdm(list(paths), desc="reading pictures", unit="source", disable=not progress):
+    for text in terminal.each(list(paths), "reading pictures", "source", shown=progress):
         path, weight = _split_weight(text)
         pictures, names, unread = _read(path, longer_side)
         skipped += unread

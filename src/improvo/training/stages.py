@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from improvo import __version__, config, files
+from improvo.continuation import SettingsRecord
 from improvo.errors import ConfigError, InputError
 from improvo.frontend.architecture import ARCHITECTURES, Architecture
 from improvo.frontend.channel_pruning import with_dead_channels, without_dead_channels
@@ -30,7 +31,7 @@ from improvo.training.trainer import Batches, Stage, Trainer, choose_device
 from improvo.training.widen import widen
 
 if TYPE_CHECKING:
-    from improvo.labeling.labelled import LabelledSequence
+    from improvo.labeling.labeled import LabeledSequence
 
 WEIGHTS = "weights.safetensors"
 SETTINGS = "settings.yaml"
@@ -114,8 +115,8 @@ def train_odometry(
         InputError: no store, a store whose labels have changed since the folder was begun, or no frame with enough
             stable points.
     """
-    from improvo.labeling.labelled import read_labels
-    from improvo.training.labelled_frames import LabelledFrames
+    from improvo.labeling.labeled import read_labels
+    from improvo.training.labeled_frames import LabeledFrames
     from improvo.training.tracked_pairs import TrackedPairs
     from improvo.training.vo_adaptation import VOAdaptationStage
 
@@ -125,7 +126,7 @@ def train_odometry(
     parent = load_weights(start)
     architecture = replace(without_dead_channels(parent).architecture, stability=True)
     network = started_network(architecture, settings.optimiser.seed, parent)
-    frames = [LabelledFrames(sequence, settings.longer_side, settings.landmarks) for sequence in sequences]
+    frames = [LabeledFrames(sequence, settings.longer_side, settings.landmarks) for sequence in sequences]
     rehearsed, sources = _rehearsal(pictures, settings, output, progress)
     pairs = TrackedPairs(frames, settings, rehearsed)
     if not sum(len(useful) for useful in pairs.useful):
@@ -164,12 +165,13 @@ def _rehearsal(
     return PairBatches(pictures, labels, as_before), [source.name for source in pictures.sources]
 
 
-def _same_labels(path: Path, sequences: Sequence[LabelledSequence]) -> None:
+def _same_labels(path: Path, sequences: Sequence[LabeledSequence]) -> None:
     """Remember what a folder is trained on; refuse to continue it with other labels."""
     now = [[s.name, s.record.frames, s.record.tracks, s.record.stable, s.record.unstable] for s in sequences]
-    if path.is_file() and json.loads(path.read_text()) != now:
+    record = SettingsRecord(path)
+    if record.difference(now):
         raise InputError(f"{path.parent}: was begun with other labels; give the same stores or another output folder")
-    files.write_json(path, now)
+    record.write(now)
 
 
 def run_stage(
@@ -322,16 +324,7 @@ _FREE = ("steps", "decay_steps", "device", "threads", "workers", "checkpoint_min
 
 def _same_settings(path: Path, settings: StageSettings) -> None:
     """Remember the settings of the folder; refuse to continue it under others."""
-
-    def fixed(values: dict[str, Any]) -> dict[str, Any]:
-        optimiser = {key: value for key, value in values["optimiser"].items() if key not in _FREE}
-        return {**values, "optimiser": optimiser}
-
-    if path.is_file():
-        before, now = fixed(config.to_dict(config.load(type(settings), path))), fixed(config.to_dict(settings))
-        changed = config.first_difference(before, now)
-        if changed:
-            raise ConfigError(
-                f"{path.parent}: was begun with {changed}; give the same settings or another output folder"
-            )
-    files.write_text(path, config.to_yaml(settings))
+    record = SettingsRecord(path, type(settings), [f"optimiser.{name}" for name in _FREE])
+    values = config.to_dict(settings)
+    record.check(values, "give the same settings or another output folder")
+    record.write(values)

@@ -10,7 +10,7 @@ import numpy as np
 
 from improvo.stability.rule import STABLE, UNSTABLE
 from improvo.training.distributed import Share
-from improvo.training.labelled_frames import FramePoints, LabelledFrames, common_points
+from improvo.training.labeled_frames import FramePoints, LabeledFrames, common_points
 from improvo.training.labels import DUSTBIN, IGNORED, label_cells
 from improvo.training.pairs import PairBatches, View
 from improvo.training.photometric import augment
@@ -57,7 +57,7 @@ class TrackedPairs:
 
     def __init__(
         self,
-        sequences: Sequence[LabelledFrames],
+        sequences: Sequence[LabeledFrames],
         settings: OdometryTrainingSettings,
         rehearsed: PairBatches | None = None,
     ) -> None:
@@ -110,7 +110,7 @@ class TrackedPairs:
         return view_a, view_b, self._two_frames(rng, view_a, view_b, rows_a, rows_b)
 
     def _partner(
-        self, rng: np.random.Generator, frames: LabelledFrames, frame_a: int, a: FramePoints
+        self, rng: np.random.Generator, frames: LabeledFrames, frame_a: int, a: FramePoints
     ) -> tuple[int, FramePoints]:
         """Another frame, as far away as drawn or, where too few points are common, nearer; or the same one."""
         settings = self.settings.pairs
@@ -127,7 +127,7 @@ class TrackedPairs:
         return frame_a, a
 
     def _view(
-        self, rng: np.random.Generator, frames: LabelledFrames, frame: int, known: FramePoints, centre: Float64
+        self, rng: np.random.Generator, frames: LabeledFrames, frame: int, known: FramePoints, centre: Float64
     ) -> TrackedView:
         settings = self.settings
         width, height = settings.views.width, settings.views.height

@@ -11,13 +11,13 @@ from __future__ import annotations
 import numpy as np
 
 from improvo.geometry.se3 import transform
-from improvo.labeling.labelled import LabelledSequence
+from improvo.labeling.labeled import LabeledSequence
 from improvo.stability.grouping import rows_of
 from improvo.stability.rule import UNSTABLE
 from improvo.types import Float64
 
 
-def largest_step_shares(sequence: LabelledSequence) -> Float64:
+def largest_step_shares(sequence: LabeledSequence) -> Float64:
     """Of every unstable track, its largest step as a share of the way (T,); NaN for all others.
 
     The way is the diagonal of the box about all of the track's error vectors.

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from improvo.continuation import first_difference
 from improvo.errors import InputError, OutputError
 from improvo.types import Features, Float32, Int64
 
@@ -69,7 +70,7 @@ def read_cache(folder: Path, fingerprint: dict[str, Any] | None = None) -> Featu
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{folder}: is a damaged feature cache; delete that folder") from None
     now = made_with if fingerprint is None else json.loads(json.dumps(fingerprint))
-    difference = _first_difference({"format": format_version, **made_with}, {"format": FORMAT, **now})
+    difference = first_difference({"format": format_version, **made_with}, {"format": FORMAT, **now})
     if difference:
         raise InputError(
             f"{folder}: features were cached with {difference}; delete that folder, or give another output folder"
@@ -111,20 +112,3 @@ def write_cache(folder: Path, fingerprint: dict[str, Any], features: dict[int, F
             shutil.rmtree(temporary, ignore_errors=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written ({error.strerror or error}); choose another folder") from None
-
-
-def _first_difference(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> str:
-    for key in sorted({*old, *new}):
-        a, b = old.get(key), new.get(key)
-        if isinstance(a, dict) and isinstance(b, dict):
-            nested = _first_difference(a, b, f"{prefix}{key}.")
-            if nested:
-                return nested
-        elif a != b:
-            return f"{prefix}{key} {_short(a)}, this run has {_short(b)}"
-    return ""
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 40 else f"{text[:37]}..."

@@ -13,7 +13,7 @@ from improvo.evaluation.settings import TrajectorySettings
 from improvo.evaluation.sources import Recorded
 from improvo.evaluation.trajectory.protocol import AlignedSegment, aligned_segments, clean_truth, errors_over_windows
 from improvo.evaluation.trajectory.protocol import evaluate_trajectory as evaluate
-from improvo.frontend.registry import load_odometry_frontend
+from improvo.frontend.registry import load_frontend
 from improvo.jobs.pool import Workers
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.visual_odometry import VisualOdometry
@@ -63,7 +63,7 @@ def run_vo(task: VoTask) -> list[VoOutcome]:
         InputError: the sequence cannot be read.
     """
     sequence = task.source.open()
-    frontend = load_odometry_frontend(task.frontend, task.max_keypoints)
+    frontend = load_frontend(task.frontend, task.max_keypoints)
     detected = [(frame.time, frontend(frame.image)) for frame in sequence]
     has_head = any(features.stability is not None for _, features in detected)
     outcomes = []

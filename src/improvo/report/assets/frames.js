@@ -48,7 +48,7 @@
     context.filter = "none";
     if (overlay !== "none") drawOverlay(points[k]);
     caption.textContent = data.frames[k].caption;
-    canvas.dataset.frame = data.frames[k].position;
+    canvas.dataset.frame = data.frames[k].frame;
     canvas.dataset.overlay = overlay;
   }
 
@@ -56,7 +56,7 @@
   function show() {
     const frame = data.frames[Number(slider.value)];
     picture.src = "data:image/jpeg;base64," + frame.jpeg;
-    document.dispatchEvent(new CustomEvent("improvo-frame", { detail: frame.position }));
+    document.dispatchEvent(new CustomEvent("improvo-frame", { detail: frame.frame }));
   }
   slider.addEventListener("input", show);
   for (const choice of document.querySelectorAll("input[name=overlay]"))

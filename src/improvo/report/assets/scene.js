@@ -72,7 +72,7 @@
     context.lineCap = "round";
     const lastOnes = count - 1 - data.last;
     for (const [wide, colourOf] of [[5, (i) => (i > lastOnes ? "#fff" : null)], [3, (i) =>
-      (i > lastOnes ? "#000" : ramp(data.positions[i] / Math.max(1, data.frames - 1)))]]) {
+      (i > lastOnes ? "#000" : ramp(data.frame_indices[i] / Math.max(1, data.frames - 1)))]]) {
       for (let i = 1; i < count; i++) {
         const colour = colourOf(i);
         if (colour && data.segments[i] === data.segments[i - 1])
@@ -109,7 +109,7 @@
     if (count) drawCamera(project, scale);
     canvas.dataset.yaw = view.yaw.toFixed(3);
     canvas.dataset.distance = view.distance.toFixed(4);
-    canvas.dataset.camera = count ? data.positions[current] : "";
+    canvas.dataset.camera = count ? data.frame_indices[current] : "";
     canvas.dataset.layer = layer;
     canvas.dataset.drawn = String(Number(canvas.dataset.drawn || 0) + 1);
   }
@@ -188,7 +188,7 @@
       redraw();
     });
   document.addEventListener("improvo-frame", (event) => {
-    for (let i = 0; i < count; i++) if (data.positions[i] <= event.detail) current = i;
+    for (let i = 0; i < count; i++) if (data.frame_indices[i] <= event.detail) current = i;
     redraw();
   });
   window.addEventListener("resize", redraw);

@@ -1,4 +1,4 @@
-"""What is trained on and what is held back to judge by: whole sequences, or the last part of a single one."""
+"""What is trained on and what is held back for validation: whole sequences, or the last part of a single one."""
 
 from __future__ import annotations
 
@@ -36,8 +36,13 @@ class Split:
     unusable: tuple[str, ...] = ()  # recordings of neither part, each with its reason
 
 
-def named(paths: Sequence[Path], evaluate: Sequence[Path], sequence: SequenceSettings) -> Split:
+def split_as_named(paths: Sequence[Path], evaluate: Sequence[Path], sequence: SequenceSettings) -> Split:
     """The split that a user names: `evaluate` is held back, also where it is among `paths`.
+
+    Args:
+        paths: recordings to train on.
+        evaluate: recordings to hold back.
+        sequence: how they are read.
 
     Raises:
         InputError: nothing is left to train on.
@@ -49,8 +54,13 @@ def named(paths: Sequence[Path], evaluate: Sequence[Path], sequence: SequenceSet
     return Split(Part(tuple(rest), sequence), Part(tuple(held), sequence), _words(held))
 
 
-def last_part(path: Path, sequence: SequenceSettings, share: float) -> Split:
+def split_last_part(path: Path, sequence: SequenceSettings, share: float) -> Split:
     """The split of a single recording: its last frames are held back.
+
+    Args:
+        path: of the recording.
+        sequence: how it is read.
+        share: of its frames to hold back.
 
     Raises:
         InputError: it cannot be opened, does not end, or has too few frames.
@@ -60,7 +70,7 @@ def last_part(path: Path, sequence: SequenceSettings, share: float) -> Split:
         raise InputError(f"{path}: is a live stream; record it first")
     cut = len(opened) - max(round(len(opened) * share), _MIN_FRAMES)
     if cut < _MIN_FRAMES:
-        raise InputError(f"{path}: has {len(opened)} frames, too few to train on some and judge by the others")
+        raise InputError(f"{path}: has {len(opened)} frames, too few to train on some and validate on the others")
     first_held, last = int(opened.indices[cut]), int(opened.indices[-1])
     training = replace(sequence, end=first_held, max_frames=None)
     held_back = replace(sequence, start=first_held, end=last + 1, max_frames=None)
@@ -68,7 +78,7 @@ def last_part(path: Path, sequence: SequenceSettings, share: float) -> Split:
     return Split(Part((path.resolve(),), training), Part((path.resolve(),), held_back), words)
 
 
-def whole_sequences(records: Sequence[SequenceRecord], sequence: SequenceSettings, share: float) -> Split:
+def split_whole_sequences(records: Sequence[SequenceRecord], sequence: SequenceSettings, share: float) -> Split:
     """The split of several recordings that were all labelled: whole ones are held back, evenly spread over the list.
 
     Args:
@@ -82,7 +92,7 @@ def whole_sequences(records: Sequence[SequenceRecord], sequence: SequenceSetting
     unusable = tuple(f"{record.name}: {record.reason}" for record in records if record.state != DONE)
     paths = [Path(record.path) for record in records if record.state == DONE]
     if len(paths) == 1:
-        return replace(last_part(paths[0], sequence, share), unusable=unusable)
+        return replace(split_last_part(paths[0], sequence, share), unusable=unusable)
     count = min(max(1, round(len(paths) * share)), len(paths) - 1)
     chosen = {-(-len(paths) * (part + 1) // count) - 1 for part in range(count)}  # rounded up: never the first
     held = [path for row, path in enumerate(paths) if row in chosen]
@@ -90,7 +100,7 @@ def whole_sequences(records: Sequence[SequenceRecord], sequence: SequenceSetting
     return Split(Part(tuple(rest), sequence), Part(tuple(held), sequence), _words(held), unusable)
 
 
-def remembered(path: Path, choose: Callable[[], Split]) -> Split:
+def remembered_split(path: Path, choose: Callable[[], Split]) -> Split:
     """The split that `path` remembers from an earlier run, else the one that `choose` makes."""
     if path.is_file():
         try:
@@ -109,6 +119,12 @@ def share_labels(store: Path, records: Sequence[SequenceRecord], part: Part, tar
     """Put the part's sequences of one label store into another of the same settings: they are not labelled twice.
 
     Files are hard links where the file system has them, copies elsewhere.
+
+    Args:
+        store: the label store that has them.
+        records: of that store.
+        part: the sequences that are wanted.
+        target: the other label store, made if need be.
     """
     by_path = {record.path: record for record in records}
     target.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,8 @@ from rendered_walk import write_walk
 from improvo.cli.main import main
 from improvo.errors import InputError, MissingExtraError
 from improvo.jobs.on_ray import run_on_ray
-from improvo.jobs.processes import Tick, WorkerDiedError
+from improvo.jobs.processes import Tick
+from improvo.jobs.workers import WorkerDiedError
 
 
 def halve(number: int, tick: Tick) -> tuple[int, str | None, str]:

@@ -31,7 +31,7 @@ def camera_x(frame: int) -> float:
     return 0.03 * frame
 
 
-def write_labelled_scene(
+def write_labeled_scene(
     folder: Path,
     name: str = "walls",
     keypoint_noise: float = 0.0,

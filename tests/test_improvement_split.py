@@ -8,7 +8,13 @@ import pytest
 from rendered_walk import write_walk
 
 from improvo.errors import InputError
-from improvo.improvement.held_back import last_part, named, remembered, share_labels, whole_sequences
+from improvo.improvement.split import (
+    remembered_split,
+    share_labels,
+    split_as_named,
+    split_last_part,
+    split_whole_sequences,
+)
 from improvo.labeling.store import DONE, FAILED, SequenceRecord, read_records
 from improvo.sequences import SequenceSettings, open_sequence
 
@@ -35,7 +41,7 @@ def records(count: int, failed: tuple[int, ...] = ()) -> list[SequenceRecord]:
     ],
 )
 def test_the_last_part_of_one_recording_is_the_rest_of_what_is_trained_on(walk: Path, how: SequenceSettings) -> None:
-    split = last_part(walk, how, 0.2)
+    split = split_last_part(walk, how, 0.2)
     training = open_sequence(walk, split.training.sequence).indices.tolist()
     held_back = open_sequence(walk, split.held_back.sequence).indices.tolist()
     assert training + held_back == open_sequence(walk, how).indices.tolist()
@@ -45,7 +51,7 @@ def test_the_last_part_of_one_recording_is_the_rest_of_what_is_trained_on(walk: 
 
 def test_a_recording_that_is_too_short_is_refused(walk: Path) -> None:
     with pytest.raises(InputError, match="has 5 frames, too few"):
-        last_part(walk, SequenceSettings(end=5), 0.2)
+        split_last_part(walk, SequenceSettings(end=5), 0.2)
 
 
 @pytest.mark.parametrize(
@@ -53,7 +59,7 @@ def test_a_recording_that_is_too_short_is_refused(walk: Path) -> None:
     [(2, 0.2, [1]), (5, 0.2, [4]), (10, 0.2, [4, 9]), (3, 0.9, [1, 2]), (11, 0.2, [5, 10])],
 )
 def test_one_sequence_in_five_is_held_back_and_never_the_first(count: int, share: float, expected: list[int]) -> None:
-    split = whole_sequences(records(count), SequenceSettings(), share)
+    split = split_whole_sequences(records(count), SequenceSettings(), share)
     assert [int(path.name[1:]) for path in split.held_back.paths] == expected
     assert len(split.training.paths) == count - len(expected)
     assert not set(split.training.paths) & set(split.held_back.paths)
@@ -61,12 +67,12 @@ def test_one_sequence_in_five_is_held_back_and_never_the_first(count: int, share
 
 
 def test_what_has_no_labels_is_in_neither_part(walk: Path) -> None:
-    split = whole_sequences(records(4, failed=(3, 1)), SequenceSettings(), 0.2)
+    split = split_whole_sequences(records(4, failed=(3, 1)), SequenceSettings(), 0.2)
     assert [path.name for path in split.training.paths] == ["s0"]
     assert [path.name for path in split.held_back.paths] == ["s2"]
     assert split.unusable == ("s1: black", "s3: black")
     only = [SequenceRecord("walk", str(walk), DONE), *records(2, failed=(0, 1))]
-    split = whole_sequences(only, SequenceSettings(), 0.2)
+    split = split_whole_sequences(only, SequenceSettings(), 0.2)
     assert split.training.paths == split.held_back.paths == (walk,)
     assert split.training.sequence.end == split.held_back.sequence.start == 24
     assert len(split.unusable) == 2
@@ -74,16 +80,16 @@ def test_what_has_no_labels_is_in_neither_part(walk: Path) -> None:
 
 def test_what_the_user_names_is_not_trained_on(tmp_path: Path) -> None:
     a, b, c = (tmp_path / name for name in "abc")
-    split = named([a, b], [b, c], SequenceSettings())
+    split = split_as_named([a, b], [b, c], SequenceSettings())
     assert split.training.paths == (a,)
     assert split.held_back.paths == (b, c)
     with pytest.raises(InputError, match="leave some to train on"):
-        named([a], [a], SequenceSettings())
+        split_as_named([a], [a], SequenceSettings())
 
 
 def test_the_split_is_made_once(walk: Path, tmp_path: Path) -> None:
-    made = remembered(tmp_path / "split.json", lambda: last_part(walk, SequenceSettings(stride=2), 0.3))
-    assert remembered(tmp_path / "split.json", lambda: pytest.fail("made again")) == made
+    made = remembered_split(tmp_path / "split.json", lambda: split_last_part(walk, SequenceSettings(stride=2), 0.3))
+    assert remembered_split(tmp_path / "split.json", lambda: pytest.fail("made again")) == made
 
 
 def test_shared_labels_keep_their_content_and_get_the_name_of_the_new_store(tmp_path: Path) -> None:
@@ -98,7 +104,7 @@ def test_shared_labels_keep_their_content_and_get_the_name_of_the_new_store(tmp_
         (survey / record.name / "label.json").write_text("{}")
     for name in (".improvo.json", "settings.yaml"):
         (survey / name).write_text("{}")
-    held_back = named([Path(both[0].path)], [Path(both[1].path)], SequenceSettings()).held_back
+    held_back = split_as_named([Path(both[0].path)], [Path(both[1].path)], SequenceSettings()).held_back
     for _ in range(2):  # again, as after a kill: nothing changes
         share_labels(survey, both, held_back, tmp_path / "held-back")
         (found,) = read_records(tmp_path / "held-back")

@@ -9,9 +9,9 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from improvo import config
+from improvo.continuation import SettingsRecord
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import inverse
@@ -26,7 +26,7 @@ RUN_FILE, TRAJECTORY_FILE = "run.json", "trajectory.txt"
 
 
 @dataclass(frozen=True)
-class LabelledSequence:
+class LabeledSequence:
     """One finished sequence of a store; tables are read when they are first asked for."""
 
     folder: Path
@@ -76,7 +76,7 @@ class LabelledSequence:
         return poses
 
     def image(self, frame: int) -> UInt8:
-        """The grey image (H, W) at a position of the processed sequence, packed or from the recording.
+        """The grey image (H, W) of a frame of the processed sequence, packed or from the recording.
 
         Raises:
             InputError: neither is there.
@@ -90,11 +90,11 @@ class LabelledSequence:
         from improvo.sequences import open_sequence
 
         sequence = open_sequence(self.record.path, self.settings)
-        rows = np.searchsorted(sequence.indices, self.frames.index)
+        rows = np.searchsorted(sequence.indices, self.frames.source_index)
         return lambda frame: sequence[int(rows[frame])].image
 
 
-def read_labels(folder: Path) -> list[LabelledSequence]:
+def read_labels(folder: Path) -> list[LabeledSequence]:
     """All finished sequences of a store, by name.
 
     Raises:
@@ -102,12 +102,12 @@ def read_labels(folder: Path) -> list[LabelledSequence]:
     """
     records = read_records(folder)
     try:
-        values = yaml.safe_load((folder / SETTINGS_FILE).read_text())
+        values = SettingsRecord(folder / SETTINGS_FILE).read()
         settings = config.from_dict(SequenceSettings, values["sequence"], where=str(folder / SETTINGS_FILE))
         rule = config.from_dict(LabelSettings, values["labels"], where=str(folder / SETTINGS_FILE))
-    except (OSError, yaml.YAMLError, KeyError, TypeError):
+    except (KeyError, TypeError):
         raise InputError(f"{folder}: is no label store; `improvo label SEQUENCE... -o {folder}` makes one") from None
     done = [record for record in records if record.state == DONE]
     if not done:
         raise InputError(f"{folder}: has no labelled sequence; see the reasons with `improvo label`, and run it again")
-    return [LabelledSequence(folder / record.name, record, settings, rule) for record in done]
+    return [LabeledSequence(folder / record.name, record, settings, rule) for record in done]

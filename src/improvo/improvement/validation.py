@@ -1,11 +1,14 @@
-"""Measuring a frontend on what was held back, with and without ground truth."""
+"""Measuring a frontend on what was held back, with and without ground truth, and which of two is better."""
 
 from __future__ import annotations
 
+import json
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,33 +17,138 @@ from improvo.evaluation.pose.pairs import draw_pairs
 from improvo.evaluation.pose.unlabelled import Survival, surviving_matches, usable_gaps
 from improvo.evaluation.settings import PoseSettings
 from improvo.evaluation.sources import LoadedFrontend, Recorded
+from improvo.evaluation.statistics import Bootstrap
 from improvo.evaluation.trajectory.protocol import clean_truth
-from improvo.improvement.candidate import Candidate
-from improvo.improvement.held_back import Part
-from improvo.improvement.judgement import Judgement, write_judgement
-from improvo.improvement.settings import JudgeSettings
+from improvo.files import write_json
+from improvo.improvement.folder import Candidate
+from improvo.improvement.settings import ValidationSettings
+from improvo.improvement.split import Part
 from improvo.jobs.pool import Workers
-from improvo.labeling.labelled import LabelledSequence, read_labels
+from improvo.labeling.labeled import LabeledSequence, read_labels
 from improvo.labeling.store import DONE, SequenceRecord
 from improvo.sequences import Sequence, open_sequence
 from improvo.stability.rule import IGNORE
 
+_RESAMPLES, _CONFIDENCE = 1000, 0.95
 
-def judge(
+
+@dataclass(frozen=True)
+class Validation:
+    """What was measured of a frontend on the part that was held back; of all frontends on the same frames and pairs."""
+
+    frames: int  # that the odometry was given
+    tracked: int  # that it gave a pose to
+    track_length: float  # mean number of frames
+    stable_share: float  # stable / (stable + unstable) tracks
+    error: float  # median re-projection error of labelled tracks, pixels; NaN without any
+    labels: dict[str, int]  # tracks by label
+    agreeing: dict[str, list[int]]  # gap -> surviving matches of every pair
+    share: dict[str, float]  # gap -> mean share of keypoints that survive
+    pose: dict[str, float] = field(default_factory=dict)  # success rates, where there are depth and true poses
+    failures: tuple[str, ...] = ()  # sequences that got no labels, with the reason
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def gaps(self) -> tuple[int, ...]:
+        """Frames between the two images of a pair."""
+        return tuple(int(gap) for gap in self.agreeing)
+
+    def surviving(self, gap: int) -> float:
+        """Mean number of surviving matches of a pair."""
+        counts = self.agreeing[str(gap)]
+        return float(np.mean(counts)) if counts else 0.0
+
+    @property
+    def score(self) -> float:
+        """Surviving matches of a pair, summed over the gaps."""
+        return sum(self.surviving(gap) for gap in self.gaps)
+
+
+def rule(settings: ValidationSettings) -> str:
+    """The decision rule, in a sentence."""
+    return (
+        "A frontend is better than the best one before it if more of its matches survive on the frames held back, "
+        "summed over the gaps, by more than chance (95 % interval), and the odometry loses with it no more than "
+        f"{100 * settings.frames_lost:g} % of the frames that it tracked with the other."
+    )
+
+
+def is_better(candidate: Validation, best: Validation, settings: ValidationSettings) -> bool:
+    """Whether a frontend is better than the best one before it; `rule` says it in words.
+
+    Args:
+        candidate: what was measured of it.
+        best: what was measured of the best one, on the same frames and pairs.
+        settings: how many frames it may lose.
+    """
+    kept = candidate.tracked >= (1 - settings.frames_lost) * best.tracked
+    return kept and gain_interval(candidate, best)[0] > 0
+
+
+def gain_interval(candidate: Validation, before: Validation, seed: int = 0) -> tuple[float, float]:
+    """95 % interval of the gain in score, over paired resamples of the pairs, gap by gap.
+
+    Args:
+        candidate: what was measured of a frontend.
+        before: what was measured of another one, on the same pairs.
+        seed: of the resamples.
+
+    Returns:
+        Lower and upper bound, in surviving matches.
+    """
+    gain = spread = 0.0
+    for gap in before.gaps:
+        gains = np.array(candidate.agreeing[str(gap)]) - np.array(before.agreeing[str(gap)])
+        if len(gains) == 0:
+            continue
+        mean = float(gains.mean())
+        lower, upper = Bootstrap(len(gains), seed, _RESAMPLES, _CONFIDENCE).interval(gains)
+        gain += mean
+        spread += max(upper - mean, mean - lower)  # the gaps share frames: taken as fully dependent
+    return gain - spread, gain + spread
+
+
+def scores(validation: Validation, start: Validation) -> dict[str, float]:
+    """What the model card says of the best: surviving matches, its own and those at the start."""
+    values = {f"surviving_matches_{gap}": validation.surviving(gap) for gap in validation.gaps}
+    values |= {f"surviving_matches_{gap}_at_the_start": start.surviving(gap) for gap in start.gaps}
+    return {name: round(value, 3) for name, value in values.items()}
+
+
+def write_validation(path: Path, validation: Validation) -> None:
+    """Keep it for later runs, as JSON (which has no NaN)."""
+    write_json(path, {**asdict(validation), "error": None if np.isnan(validation.error) else validation.error})
+
+
+def read_validation(path: Path) -> Validation:
+    """The validation of an earlier run.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    try:
+        values: dict[str, Any] = json.loads(path.read_text())
+        error = float("nan") if values["error"] is None else values["error"]
+        return Validation(**{**values, "error": error, "failures": tuple(values["failures"])})
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{path}: is damaged; remove it, and it is measured again") from None
+
+
+def validate(
     candidate: Candidate,
     part: Part,
     records: list[SequenceRecord],
-    settings: JudgeSettings,
+    settings: ValidationSettings,
     tick: Callable[[], None] = lambda: None,
     progress: bool = False,
-) -> Judgement:
+) -> Validation:
     """Measure a candidate and keep the result.
 
     Args:
         candidate: `candidate.held_back` has its labels of the part already.
         part: what was held back.
         records: of those labels.
-        settings: of the judgement.
+        settings: of the validation.
         tick: called after every pair of frames.
         progress: whether the pose protocol shows a bar.
     """
@@ -55,7 +163,7 @@ def judge(
         survivals += surviving_matches(sequence, frontend, gaps, settings.survival, tick)
     labelled = read_labels(candidate.held_back) if any(record.state == DONE for record in records) else []
     labelling = sum(record.seconds for record in records)
-    judgement = Judgement(
+    validation = Validation(
         frames=sum(len(sequence) for sequence in sequences),
         tracked=sum(record.tracked for record in records),
         labels={name: sum(getattr(record, name) for record in records) for name in ("stable", "unstable", "ignore")},
@@ -66,8 +174,8 @@ def judge(
         seconds={"label": round(labelling, 1), "evaluate": round(time.perf_counter() - started, 1)},
         **_of_labels(labelled),
     )
-    write_judgement(candidate.judgement, judgement)
-    return judgement
+    write_validation(candidate.validation, validation)
+    return validation
 
 
 def _opened(path: Path, part: Part) -> Sequence | None:
@@ -78,7 +186,7 @@ def _opened(path: Path, part: Part) -> Sequence | None:
         return None
 
 
-def _of_labels(labelled: list[LabelledSequence]) -> dict[str, float]:
+def _of_labels(labelled: list[LabeledSequence]) -> dict[str, float]:
     """Track length, share of stable tracks and error over the label tables."""
     observations = tracks = stable = with_label = 0
     errors = []
@@ -108,7 +216,7 @@ def _pose_success(
     part: Part,
     sequences: list[Sequence],
     gaps: tuple[int, ...],
-    settings: JudgeSettings,
+    settings: ValidationSettings,
     progress: bool,
 ) -> dict[str, float]:
     """Success rates of the pose protocol over the recordings that have depth and true poses; empty without any."""

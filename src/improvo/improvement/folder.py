@@ -5,23 +5,63 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from improvo import config
-from improvo.errors import ConfigError, InputError
-from improvo.files import check_output_folder, make_output_folder, write_text
-from improvo.improvement.candidate import Candidate
+from improvo.continuation import SettingsRecord
+from improvo.files import check_output_folder, make_output_folder
 from improvo.improvement.settings import ImproveSettings
 
 COMMAND = "improve"
-# what may differ when a run is continued: none of these alters a result
-_FREE = {"training.optimiser": ("device", "threads", "workers", "checkpoint_minutes", "log_every")}
+# settings of the optimiser that may differ when a run is continued: none of these alters a result
+_FREE = ("device", "threads", "workers", "checkpoint_minutes", "log_every")
 
 
-class Workspace:
+@dataclass(frozen=True)
+class Candidate:
+    """A frontend of the loop with all that is known of it: the one at the start, or one that a round has trained.
+
+    NAME/
+        weights.safetensors, .json   what it is
+        held-back/                   label store of what was held back, made with it
+        judgement.json               its `Validation`; written last
+        labels/                      label store of the training part, made with it, once it is the teacher
+        training/                    of a round: metrics and checkpoints
+        pictures/
+    """
+
+    name: str  # "start", "round 1"
+    folder: Path
+
+    @property
+    def weights(self) -> Path:
+        """Its weights file, ready for the same runtime as that of every other candidate."""
+        return self.folder / "weights.safetensors"
+
+    @property
+    def labels(self) -> Path:
+        """Label store of the training part."""
+        return self.folder / "labels"
+
+    @property
+    def held_back(self) -> Path:
+        """Label store of the part to validate on."""
+        return self.folder / "held-back"
+
+    @property
+    def training(self) -> Path:
+        """Where it was trained."""
+        return self.folder / "training"
+
+    @property
+    def validation(self) -> Path:
+        """How good it is, see `improvo.improvement.validation`."""
+        return self.folder / "judgement.json"
+
+
+class ImproveFolder:
     """OUT/
         settings.yaml          what the result depends on; other settings are refused
         split.json             which frames are trained on, and which held back
@@ -31,7 +71,8 @@ class Workspace:
 
     Args:
         folder: made if need be.
-        sequences, evaluate: as given by the user.
+        sequences: as given by the user.
+        evaluate: as given by the user.
         settings: of the loop.
         start: weights file that it starts from.
 
@@ -45,7 +86,7 @@ class Workspace:
     ) -> None:
         check_output_folder(folder, COMMAND)
         self.folder = folder
-        values = _fixed(settings)
+        values = config.to_dict(settings)
         values["frontend"]["name"] = f"sha256:{hashlib.sha256(start.read_bytes()).hexdigest()}"
         values["sequences"] = [str(path.resolve()) for path in sequences]
         values["evaluate"] = [str(path.resolve()) for path in evaluate]
@@ -67,13 +108,13 @@ class Workspace:
         return Candidate("start", self.folder / "start")
 
     def round(self, number: int) -> Candidate:
-        """The frontend that a round has taught."""
+        """The frontend that a round has trained."""
         return Candidate(f"round {number}", self.folder / f"round-{number}")
 
-    def rounds_judged(self) -> int:
-        """Rounds that are complete."""
+    def finished_rounds(self) -> int:
+        """How many rounds are complete."""
         number = 0
-        while self.round(number + 1).judgement.is_file():
+        while self.round(number + 1).validation.is_file():
             number += 1
         return number
 
@@ -88,36 +129,17 @@ class Workspace:
         return self.folder / "report.html"
 
     def _begin(self, values: dict[str, Any]) -> None:
-        path = self.folder / "settings.yaml"
-        if path.is_file():
-            try:
-                before = yaml.safe_load(path.read_text())
-            except yaml.YAMLError:
-                raise InputError(f"{path}: is damaged; choose another output folder") from None
-            difference = config.first_difference(before, values)
-            if difference and not self.split.is_file():  # nothing has come of it yet
-                for folder in (self.survey, self.start.folder):
-                    shutil.rmtree(folder, ignore_errors=True)
-            elif difference:
-                raise ConfigError(
-                    f"{self.folder}: was begun with {difference}; give the same again, or another output folder"
-                )
+        free = [f"training.optimiser.{name}" for name in _FREE]
+        record = SettingsRecord(self.folder / "settings.yaml", ImproveSettings, free)
+        if self.split.is_file():
+            record.check(values, "give the same again, or another output folder")
+        elif record.difference(values):  # nothing has come of it yet
+            for folder in (self.survey, self.start.folder):
+                shutil.rmtree(folder, ignore_errors=True)
         make_output_folder(self.folder, COMMAND)
-        write_text(path, yaml.safe_dump(values, sort_keys=False))
+        record.write(values)
         for leftover in list(self.folder.rglob(".*.partial*")):  # of a killed run; some lie in others
             if leftover.is_dir():
                 shutil.rmtree(leftover, ignore_errors=True)
             else:
                 leftover.unlink(missing_ok=True)
-
-
-def _fixed(settings: ImproveSettings) -> dict[str, Any]:
-    """The settings that the result depends on."""
-    values = config.to_dict(settings)
-    for section, names in _FREE.items():
-        target = values
-        for name in section.split("."):
-            target = target[name]
-        for name in names:
-            target.pop(name)
-    return values

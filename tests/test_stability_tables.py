@@ -8,14 +8,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from improvo.errors import InputError, OutputError
-from improvo.labeling import tables
+from improvo.stability import tables
 from improvo.stability.rule import IGNORE, STABLE, UNSTABLE, TrackLabels
 
 
-def some_labels(count: int = 5) -> TrackLabels:
+def some_labels(count: int = 5, first: int = 0) -> TrackLabels:
     rng = np.random.default_rng(0)
     return TrackLabels(
-        track=np.arange(count) * 3,
+        track=first + np.arange(count) * 3,
         point=np.arange(count) - 1,
         segment=np.zeros(count, np.int64),
         xyz=np.where(np.arange(count)[:, None] == 2, np.nan, rng.normal(size=(count, 3))),
@@ -24,7 +24,7 @@ def some_labels(count: int = 5) -> TrackLabels:
         max_error=rng.uniform(3, 9, count),
         stability=np.array([IGNORE, UNSTABLE, STABLE] * count, np.int8)[:count],
         parallax_deg=rng.uniform(0, 5, count),
-        distrusted=np.zeros(count, np.bool_),
+        withheld=np.zeros(count, np.bool_),
         errors=rng.uniform(0, 9, 20),
     )
 
@@ -34,10 +34,10 @@ def test_points_round_trip(tmp_path):
     with tables.PointsWriter(path) as writer:
         writer.write(labels)
         assert not path.exists()
-        writer.write(labels)
+        writer.write(some_labels(first=100))
     assert writer.rows == 10
     table = tables.read_points(path)
-    np.testing.assert_array_equal(table.track, np.tile(labels.track, 2))
+    np.testing.assert_array_equal(table.track, np.concatenate([labels.track, 100 + labels.track]))
     np.testing.assert_array_equal(table.xyz, np.tile(labels.xyz, (2, 1)))
     np.testing.assert_array_equal(table.stability, np.tile(labels.stability, 2))
     np.testing.assert_allclose(table.mean_error, np.tile(labels.mean_error, 2), rtol=1e-6)
@@ -49,13 +49,13 @@ def test_points_round_trip(tmp_path):
 def test_tracks_round_trip_in_row_groups(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "_ROWS_PER_GROUP", 100)
     path, rng = tmp_path / "tracks.parquet", np.random.default_rng(1)
-    frame, track = np.arange(30), np.full(30, 7)
+    frame = np.arange(30)
     keypoints = rng.uniform(0, 600, (30, 2)).astype(np.float32)
     weight, error = rng.uniform(size=30).astype(np.float32), rng.uniform(size=30)
     error[3] = np.nan
     with tables.TracksWriter(path) as writer:
-        for _ in range(9):
-            writer.write(frame, track, keypoints, weight, error)
+        for track in range(9):
+            writer.write(frame, np.full(30, track), keypoints, weight, error)
     assert pq.ParquetFile(path).num_row_groups == 3
     table = tables.read_tracks(path)
     assert len(table) == 270
@@ -89,8 +89,10 @@ def test_a_failure_leaves_nothing_behind(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_that_does_not_exist_is_one_line(tmp_path):
-    with pytest.raises(OutputError, match="cannot be written"), tables.PointsWriter(tmp_path / "no" / "points.parquet"):
+def test_a_folder_that_cannot_be_is_one_line(tmp_path):
+    (tmp_path / "file").touch()
+    path = tmp_path / "file" / "points.parquet"
+    with pytest.raises(OutputError, match="cannot be written"), tables.PointsWriter(path):
         pass
 
 

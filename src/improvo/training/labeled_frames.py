@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from improvo.geometry.se3 import transform
-from improvo.labeling.labelled import LabelledSequence
+from improvo.labeling.labeled import LabeledSequence
 from improvo.stability.grouping import medians, rows_of
 from improvo.stability.rule import IGNORE, STABLE, UNSTABLE
 from improvo.training.settings import LandmarkSettings
@@ -33,7 +33,7 @@ class FramePoints:
     seen: NDArray[np.bool_]  # (N,) whether a track saw it in this frame, or only the projection says that it is there
 
 
-class LabelledFrames:
+class LabeledFrames:
     """Random access to the frames of one labelled sequence.
 
     Args:
@@ -42,7 +42,7 @@ class LabelledFrames:
         settings: what a landmark is.
     """
 
-    def __init__(self, sequence: LabelledSequence, longer_side: int, settings: LandmarkSettings) -> None:
+    def __init__(self, sequence: LabeledSequence, longer_side: int, settings: LandmarkSettings) -> None:
         self.sequence, self.settings = sequence, settings
         camera = sequence.camera
         self.scale = min(1.0, longer_side / max(camera.width, camera.height))

@@ -1,0 +1,68 @@
+"""What the commands print: lines for people on stdout, or with --json one JSON value; --quiet leaves results alone."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from improvo import terminal
+
+_silent = False  # no lines for people
+_as_json = False
+
+
+@contextmanager
+def configured(quiet: bool, as_json: bool) -> Iterator[None]:
+    """For the command within; a command may run others."""
+    global _silent, _as_json
+    before = _silent, _as_json
+    _silent, _as_json = quiet or as_json, as_json
+    try:
+        with terminal.quiet(quiet):
+            yield
+    finally:
+        _silent, _as_json = before
+
+
+def say(text: str) -> None:
+    """A line about what was done; left out by --quiet and --json."""
+    if not _silent:
+        _line(text)
+
+
+def next_step(text: str) -> None:
+    """The last line: what to do next."""
+    say(f"next: {text}")
+
+
+def notice(text: str) -> None:
+    """A line on stderr about work that takes a while."""
+    if not _silent:
+        print(text, file=sys.stderr, flush=True)
+
+
+def figures(data: Any, text: str) -> None:
+    """The result of a command that ends in figures: a text for people, or JSON with --json; --quiet prints it too."""
+    if _as_json:
+        print(json.dumps(data, indent=2, allow_nan=False))
+    elif text:
+        _line(text.rstrip("\n"))
+
+
+def as_json() -> bool:
+    """Whether the command was given --json."""
+    return _as_json
+
+
+def _line(text: str) -> None:
+    """Print past the progress bars, where there are any."""
+    if "tqdm" not in sys.modules:
+        print(text, flush=True)
+        return
+    from tqdm import tqdm
+
+    with tqdm.external_write_mode():
+        print(text, flush=True)

@@ -1,0 +1,120 @@
+"""`improvo show stability` and `improvo show matches`: what networks and frontends make of a recording."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.output import next_step, say
+from improvo.cli.show_options import (
+    add_frames,
+    add_palette,
+    add_target,
+    asked_frames,
+    chosen_frames,
+    target_path,
+    write_pictures,
+)
+from improvo.errors import InputError
+
+if TYPE_CHECKING:
+    from improvo.sequences import Sequence
+
+
+def add_stability_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `improvo show stability`."""
+    _add_recording(parser, "./stability.png")
+    parser.add_argument("--frontend", metavar="NAME", help="network with a stability head (default: the run's)")
+    add_frames(parser)
+    add_sequence_arguments(parser)
+    add_config_arguments(parser)
+
+
+def run_stability(arguments: argparse.Namespace) -> None:
+    """Dense stability over the image."""
+    from improvo.frontend.network import NetworkFrontend
+    from improvo.frontend.registry import load_frontend
+    from improvo.frontend.settings import DEFAULT_FRONTEND
+    from improvo.report.palettes import palette
+    from improvo.report.stability_picture import paint_stability
+
+    sequence, frontend_of_run = _opened_sequence(arguments)
+    name = arguments.frontend or frontend_of_run or DEFAULT_FRONTEND
+    frontend = load_frontend(name)
+    if not isinstance(frontend, NetworkFrontend):
+        raise InputError(f"{name}: has no stability head; name a network that has one with --frontend")
+    colours, shown_name = palette(arguments.palette), Path(name).stem
+    frames = asked_frames(arguments, len(sequence))
+    times = sequence.times
+    fps = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 30.0
+    write_pictures(
+        arguments,
+        Path(),
+        frames,
+        lambda frame: paint_stability(sequence[frame].image, frontend, f"frame {frame}, {shown_name}", colours),
+        fps,
+    )
+    next_step("open it")
+
+
+def add_matches_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `improvo show matches`."""
+    _add_recording(parser, "./matches.png")
+    parser.add_argument("--frontends", default="superpoint-vo,sift", metavar="A,B", help="one row of panels each")
+    parser.add_argument("--pair", default="0,30", metavar="A,B", help="the two frames")
+    parser.add_argument("--max-keypoints", type=int, default=500, metavar="N", help="per frame")
+    add_sequence_arguments(parser)
+    add_config_arguments(parser)
+
+
+def run_matches(arguments: argparse.Namespace) -> None:
+    """Two frontends on one image pair."""
+    import numpy as np
+
+    from improvo.files import write_png
+    from improvo.frontend.registry import load_frontend
+    from improvo.report.match_picture import paint_matches
+    from improvo.report.palettes import palette
+
+    sequence, _ = _opened_sequence(arguments)
+    pair = chosen_frames(arguments.pair, len(sequence))
+    if len(pair) != 2 or "," not in arguments.pair:
+        raise InputError(f"--pair {arguments.pair}: give two frames, such as 0,30")
+    image_a, image_b = (sequence[frame].image for frame in pair)
+    depth_a = sequence.depth(pair[0])
+    rows = [
+        paint_matches(
+            load_frontend(name, arguments.max_keypoints, opencv_defaults=True),
+            image_a,
+            image_b,
+            depth_a,
+            sequence.camera,
+            palette(arguments.palette),
+        )
+        for name in arguments.frontends.split(",")
+    ]
+    target = target_path(arguments.output, Path(), "matches.png")
+    write_png(target, np.concatenate(rows))
+    say(str(target))
+    next_step("open it")
+
+
+def _add_recording(parser: argparse.ArgumentParser, default: str) -> None:
+    parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a recording, or the folder of a run")
+    add_target(parser, default)
+    add_palette(parser)
+
+
+def _opened_sequence(arguments: argparse.Namespace) -> tuple[Sequence, str | None]:
+    """The sequence of a command that takes a recording or the output folder of a run, and the run's frontend."""
+    from improvo.odometry.run_folder import RunFolder
+    from improvo.odometry.run_settings import RunSettings
+    from improvo.sequences import open_sequence
+
+    path: Path = arguments.sequence
+    if (path / "run.json").is_file():
+        run_folder = RunFolder(path)
+        return run_folder.sequence, str(run_folder.report["configuration"]["frontend"]["name"])
+    return open_sequence(path, settings_from(RunSettings, arguments).sequence), None

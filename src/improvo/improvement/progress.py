@@ -1,0 +1,89 @@
+"""What the loop says while it runs: progress on stderr, results as lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from improvo.improvement.folder import Candidate
+from improvo.improvement.split import Split
+from improvo.improvement.validation import Validation, gain_interval
+from improvo.labeling.store import DONE, SequenceRecord
+from improvo.terminal import progress
+
+Tick = Callable[..., None]  # told that so many more are done; one if it is not told how many
+
+
+class ImprovementProgress:
+    """What the loop reports to; by itself it shows nothing.
+
+    Args:
+        line: is given each line of the results.
+        shown: whether progress is shown on stderr.
+    """
+
+    def __init__(self, line: Callable[[str], None] = lambda text: None, shown: bool = False) -> None:
+        self._line, self.shown = line, shown
+        self._said: set[tuple[str, str]] = set()
+
+    @contextmanager
+    def bar(self, words: str, unit: str, total: int | None = None) -> Iterator[Tick]:
+        """Show how far a step is; call what it gives.
+
+        Args:
+            words: what is being done.
+            unit: of what is counted, in the singular.
+            total: how many there are, where that is known.
+        """
+        with progress(words, unit, total, self.shown) as bar:
+            yield bar.advance
+
+    def line(self, text: str) -> None:
+        """One line of the results."""
+        self._line(text)
+
+    def labeled(self, what: str, record: SequenceRecord) -> None:
+        """A sequence was labelled, or why not; said once."""
+        if (what, record.name) in self._said:
+            return
+        self._said.add((what, record.name))
+        if record.state != DONE:
+            self.line(f"{what}, {record.name}: not labelled: {record.reason}")
+            return
+        self.line(
+            f"{what}, {record.name}: {record.tracked} of {record.frames} frames with a pose; "
+            f"{record.stable} stable, {record.unstable} unstable tracks"
+        )
+
+    def split(self, split: Split) -> None:
+        """What is held back."""
+        for reason in split.unusable:
+            self.line(f"left out: {reason}")
+        self.line(f"held back, never trained on: {split.words}")
+
+    def validated(self, candidate: Candidate, validation: Validation, start: Validation, better: bool | None) -> None:
+        """A summary of one candidate.
+
+        Args:
+            candidate: the frontend.
+            validation: what was measured of it.
+            start: what was measured of the frontend at the start.
+            better: whether it is better than the best one before it; None for the start.
+        """
+        gaps = " / ".join(map(str, validation.gaps))
+        counts = " / ".join(f"{validation.surviving(gap):.1f}" for gap in validation.gaps)
+        text = f"{candidate.name}: {counts} matches survive {gaps} frames, {validation.score:.1f} in all"
+        if better is not None:
+            text += f" ({gain_words(validation, start)})"
+        text += f"; {validation.tracked} of {validation.frames} frames tracked"
+        self.line(text if better is None else f"{text}; {'better, kept' if better else 'not better, not kept'}")
+
+
+def gain_words(validation: Validation, start: Validation) -> str:
+    """The gain in surviving matches over the start, with its interval."""
+    gain = validation.score - start.score
+    low, high = gain_interval(validation, start)
+    if start.score <= 0:
+        return f"{gain:+.1f}, 95 % interval {low:+.1f} to {high:+.1f}"
+    share = 100 / start.score
+    return f"{gain * share:+.0f} %, 95 % interval {low * share:+.0f} to {high * share:+.0f} %"

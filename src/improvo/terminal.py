@@ -1,0 +1,120 @@
+"""How far a long command is: a bar on a terminal, elsewhere a line now and then, and nothing where it is quiet."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from typing import Any, TextIO, TypeVar
+
+T = TypeVar("T")
+
+INTERVAL = 20.0  # seconds between two lines, where there is no terminal
+_quiet = False
+
+
+@contextmanager
+def quiet(quiet: bool = True) -> Iterator[None]:
+    """Show no progress within; `quiet` False shows it."""
+    global _quiet
+    before, _quiet = _quiet, quiet
+    try:
+        yield
+    finally:
+        _quiet = before
+
+
+class Progress:
+    """Told by a loop how far it is; shows nothing itself."""
+
+    def advance(self, count: int = 1) -> None:
+        """So many more are done."""
+
+    def describe(self, words: str) -> None:
+        """What is being done from here on."""
+
+    def note(self, text: str) -> None:
+        """A remark beside the bar."""
+
+
+@contextmanager
+def progress(words: str, unit: str, total: int | None = None, shown: bool = True, done: int = 0) -> Iterator[Progress]:
+    """Show the progress of the block on stderr.
+
+    Args:
+        words: what is being done.
+        unit: of what is counted, in the singular.
+        total: how many there are, where that is known.
+        shown: False shows nothing.
+        done: so many are done already.
+    """
+    if not shown or _quiet:
+        yield Progress()
+    elif sys.stderr.isatty():
+        from tqdm import tqdm
+
+        with tqdm(desc=words, unit=unit, total=total, initial=done, smoothing=0.1, delay=0.5, leave=False) as bar:
+            yield _Bar(bar)
+    else:
+        yield _Lines(words, unit, total, done, sys.stderr)
+
+
+def each(items: Collection[T], words: str, unit: str, shown: bool = True) -> Iterator[T]:
+    """The items, with the progress of the loop over them; arguments as `progress`."""
+    with progress(words, unit, len(items), shown) as told:
+        for item in items:
+            yield item
+            told.advance()
+
+
+class _Bar(Progress):
+    def __init__(self, bar: Any) -> None:
+        self._bar = bar
+
+    def advance(self, count: int = 1) -> None:
+        self._bar.update(count)
+
+    def describe(self, words: str) -> None:
+        self._bar.set_description(words)
+
+    def note(self, text: str) -> None:
+        self._bar.set_postfix_str(text, refresh=False)
+
+
+class _Lines(Progress):
+    def __init__(self, words: str, unit: str, total: int | None, done: int, stream: TextIO) -> None:
+        self._words, self._unit, self._total, self._stream = words, unit, total, stream
+        self._first = self._done = done
+        self._note = ""
+        self._began = self._said = time.monotonic()
+
+    def advance(self, count: int = 1) -> None:
+        self._done += count
+        now = time.monotonic()
+        if now - self._said >= INTERVAL:
+            self._said = now
+            print(self._text(now - self._began), file=self._stream, flush=True)
+
+    def describe(self, words: str) -> None:
+        self._words = words
+
+    def note(self, text: str) -> None:
+        self._note = text
+
+    def _text(self, seconds: float) -> str:
+        rate = (self._done - self._first) / max(seconds, 1e-9)
+        text = f"{self._words}: {self._done}"
+        if self._total:
+            text += f" of {self._total} {self._unit}s ({100 * self._done // self._total} %), {rate:.3g} a second"
+            if rate > 0:
+                text += f", {_duration((self._total - self._done) / rate)} left"
+        else:
+            text += f" {self._unit}s, {rate:.3g} a second"
+        return f"{text}; {self._note}" if self._note else text
+
+
+def _duration(seconds: float) -> str:
+    minutes, seconds = divmod(round(max(seconds, 0)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"

@@ -1,0 +1,269 @@
+"""What the commands do, as functions: each opens its input, calls one room, and returns a typed result.
+
+Nothing is printed. Heavy libraries load when a verb is called.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from improvo.evaluation.settings import PoseSettings, TrajectorySettings
+    from improvo.evaluation.trajectory.protocol import TrajectoryErrors
+    from improvo.frontend import Frontend
+    from improvo.frontend.weights import DataSource
+    from improvo.improvement.improve import Improvement
+    from improvo.improvement.settings import ImproveSettings
+    from improvo.labeling.labeler import LabeledRun
+    from improvo.labeling.store import SequenceRecord
+    from improvo.odometry.run_settings import RunSettings
+    from improvo.sequences import Sequence as ImageSequence
+    from improvo.sequences import SequenceSettings
+    from improvo.training.settings import OdometryTrainingSettings
+    from improvo.types import Trajectory
+
+PathLike = str | Path
+
+
+def run(
+    sequence: ImageSequence | PathLike,
+    output: PathLike,
+    settings: RunSettings | None = None,
+    frontend: Frontend | None = None,
+) -> LabeledRun:
+    """Visual odometry on one sequence, as `improvo run` does it.
+
+    Args:
+        sequence: an open sequence, or the path of anything that `open_sequence` recognises.
+        output: folder for trajectory, map, tracks, labels and report.
+        settings: all numbers; `preset(RunSettings, "paper")` has the paper's.
+        frontend: in place of the one that the settings name.
+
+    Raises:
+        InputError: the sequence cannot be opened or has too few frames.
+        OutputError: the folder cannot be used.
+    """
+    from improvo.labeling.labeler import run_and_label
+    from improvo.odometry.run_settings import RunSettings
+    from improvo.sequences import open_sequence
+
+    settings = settings or RunSettings()
+    if isinstance(sequence, str | Path):
+        sequence = open_sequence(sequence, settings.sequence)
+    return run_and_label(sequence, Path(output), settings, frontend=frontend)
+
+
+def label(
+    sequences: Sequence[PathLike],
+    output: PathLike,
+    settings: RunSettings | None = None,
+    workers: int = 1,
+    ray: str | None = None,
+) -> list[SequenceRecord]:
+    """Stability labels for many sequences, as `improvo label` makes them; what is done already is not done again.
+
+    Args:
+        sequences: paths of recordings.
+        output: folder of the label store.
+        settings: all numbers; by default those of `LabelRunSettings`.
+        workers: sequences at a time, a process for each.
+        ray: address of a Ray cluster that does the work.
+
+    Returns:
+        One record for each sequence, in their order; `reason` says why one has no labels.
+
+    Raises:
+        InputError: none of them could be labelled.
+        ConfigError: the store was made with other settings.
+    """
+    from improvo.labeling.label_sequences import label_sequences
+    from improvo.odometry.run_settings import LabelRunSettings
+
+    chosen = settings or LabelRunSettings()
+    return label_sequences([Path(path) for path in sequences], Path(output), chosen, workers, ray=ray)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What a training stage leaves."""
+
+    weights: Path  # a file that `load_frontend` takes
+    metrics: dict[str, float]  # the last row of metrics.jsonl
+
+
+def train_odometry(
+    labels: Sequence[PathLike],
+    output: PathLike,
+    settings: OdometryTrainingSettings | None = None,
+    start: PathLike = "superpoint",
+    pictures: Sequence[str] = (),
+    data: Sequence[DataSource] = (),
+) -> Trained:
+    """VO adaptation, as `improvo train odometry` does it (needs the extra `train`).
+
+    Args:
+        labels: label stores, as `label` makes them.
+        output: folder for weights, metrics and checkpoints; an unfinished one is continued.
+        settings: all numbers.
+        start: weights to start from, a bundled name or a file.
+        pictures: sources of homography pairs that are trained on beside the labels.
+        data: what the model card says about the recordings.
+
+    Raises:
+        MissingExtraError: torch is not installed.
+        InputError: no labels that teach anything.
+    """
+    from improvo.frontend.weights import find_weights
+    from improvo.training.settings import OdometryTrainingSettings
+
+    need_torch()
+    from improvo.training import stages
+
+    settings, folder = settings or OdometryTrainingSettings(), Path(output)
+    metrics = stages.train_odometry(
+        [Path(path) for path in labels], settings, folder, find_weights(start), tuple(data), False, list(pictures)
+    )
+    return Trained(folder / "weights.safetensors", metrics)
+
+
+def need_torch() -> None:
+    """Refuse to train without torch, before any work is done.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    import importlib.util
+
+    from improvo.errors import MissingExtraError
+
+    if importlib.util.find_spec("torch") is None:
+        raise MissingExtraError("training", "train")
+
+
+def improve(
+    sequences: Sequence[PathLike],
+    output: PathLike,
+    settings: ImproveSettings | None = None,
+    rounds: int = 1,
+    evaluate: Sequence[PathLike] = (),
+    workers: int = 1,
+) -> Improvement:
+    """The loop: label, train, validate, and keep the better weights, as `improvo improve` does it.
+
+    Args:
+        sequences: recordings without ground truth; part of them is held out.
+        output: folder for weights, rounds and report; an unfinished one is continued.
+        settings: all numbers.
+        rounds: of labelling, training and validation.
+        evaluate: recordings to hold out; without any, some of `sequences`, or the last part of a single one.
+        workers: sequences labelled at a time.
+
+    Raises:
+        MissingExtraError: torch is not installed.
+        InputError: nothing could be labelled.
+        ConfigError: the folder was begun with other settings.
+    """
+    need_torch()
+    from improvo.improvement.improve import improve as run_rounds
+    from improvo.improvement.settings import ImproveSettings
+
+    recordings, held_out = [Path(path) for path in sequences], [Path(path) for path in evaluate]
+    return run_rounds(recordings, Path(output), settings or ImproveSettings(), rounds, held_out, workers)
+
+
+@dataclass(frozen=True)
+class PoseAccuracy:
+    """A cell of Table 1: how often the relative pose of two images is right."""
+
+    frontend: str
+    estimator: str  # the solver: opencv or poselib
+    gap: int  # frames between the two images
+    pairs: int
+    rotation_success: float  # share of the pairs with less than the largest rotation error (5 degrees)
+    translation_success: float  # share with less than the largest translation error (5 cm)
+    rotation_interval: tuple[float, float]  # of the share, by bootstrap
+    translation_interval: tuple[float, float]
+
+
+def evaluate_pose(
+    sequences: Sequence[PathLike],
+    frontends: Sequence[str],
+    settings: PoseSettings | None = None,
+    sequence_settings: SequenceSettings | None = None,
+    workers: int = 1,
+) -> list[PoseAccuracy]:
+    """3D-to-2D pose estimation (paper, Table 1), as `improvo evaluate pose` does it.
+
+    Args:
+        sequences: recordings with depth and true poses.
+        frontends: bundled names, weights files or peers; all get the same pairs.
+        settings: of the protocol.
+        sequence_settings: how the recordings are read.
+        workers: processes.
+
+    Raises:
+        InputError: a recording without depth or poses, or a gap without pairs.
+    """
+    import tempfile
+
+    from improvo.evaluation.pose.results import results
+    from improvo.evaluation.pose.run import run_pose_protocol
+    from improvo.evaluation.settings import PoseSettings
+    from improvo.evaluation.sources import LoadedFrontend, Recorded
+    from improvo.jobs.pool import Workers
+    from improvo.sequences import SequenceSettings
+
+    settings = settings or PoseSettings()
+    sources = [Recorded(str(path), sequence_settings or SequenceSettings()) for path in sequences]
+    loaded = [LoadedFrontend(name, settings.max_keypoints) for name in frontends]
+    for frontend in loaded:
+        frontend.check()
+    with tempfile.TemporaryDirectory(prefix="improvo-") as cache, Workers(workers) as pool:
+        rows = results(run_pose_protocol(list(sources), list(loaded), settings, Path(cache), pool))["rows"]
+    return [
+        PoseAccuracy(
+            row["frontend"],
+            row["estimator"],
+            row["gap"],
+            row["pairs"],
+            row["rotation_success"],
+            row["translation_success"],
+            tuple(row["rotation_success_interval"]),
+            tuple(row["translation_success_interval"]),
+        )
+        for row in rows
+    ]
+
+
+def evaluate_trajectory(
+    estimate: Trajectory | PathLike, truth: Trajectory | PathLike, settings: TrajectorySettings | None = None
+) -> TrajectoryErrors:
+    """Errors of a trajectory against the truth (paper, Table 2), as `improvo evaluate trajectory` has them.
+
+    Args:
+        estimate: poses, a trajectory file, or the output folder of a run.
+        truth: poses, a trajectory file, or a sequence that has true poses.
+        settings: alignment and the lengths of sub-trajectories.
+
+    Raises:
+        InputError: a file that is no trajectory, a sequence without true poses, or no common time.
+    """
+    from improvo.errors import InputError
+    from improvo.evaluation.settings import TrajectorySettings
+    from improvo.evaluation.trajectory.protocol import evaluate_trajectory as errors_of
+    from improvo.geometry.trajectory_files import read_trajectory
+    from improvo.sequences import open_sequence
+
+    if isinstance(estimate, str | Path):
+        path = Path(estimate)
+        estimate = read_trajectory(path / "trajectory.txt" if path.is_dir() else path)
+    if isinstance(truth, str | Path):
+        path = Path(truth)
+        found = open_sequence(path).ground_truth if path.is_dir() else read_trajectory(path)
+        if found is None:
+            raise InputError(f"{path}: has no true poses; give a trajectory file or a sequence that has them")
+        truth = found
+    return errors_of(estimate, truth, settings or TrajectorySettings())

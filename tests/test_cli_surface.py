@@ -1,0 +1,192 @@
+"""The command line as a whole: one table, help with defaults, presets, manners, and nothing made before a look."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import io
+import json
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from improvo import config, terminal
+from improvo.cli.commands import COMMANDS, leaves, settings_class
+from improvo.cli.flags import comments
+from improvo.cli.main import main
+from improvo.odometry.run_settings import RunSettings
+from improvo.simulation import bundled_sequence
+
+ALL = [words for words, _ in leaves()]
+WITH_PAPER = (["run"], ["label"], ["train", "odometry"], ["improve"], ["evaluate", "pose"], ["evaluate", "vo"])
+
+
+@functools.cache
+def help_of(words: tuple[str, ...]) -> str:
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), pytest.raises(SystemExit) as end:
+        main([*words, "--help"])
+    assert end.value.code == 0
+    return text.getvalue()
+
+
+@pytest.mark.parametrize("words", ALL, ids=" ".join)
+def test_help_of_every_command(words: tuple[str, ...]) -> None:
+    text = " ".join(help_of(words).split())
+    assert f"usage: improvo {' '.join(words)}" in text
+    assert "(default: None)" not in text
+    assert not re.search(r"\(default: [^)]*\)[^-]{0,3}\(default", text)
+    assert "--quiet" in text
+
+
+def test_help_is_quick_and_lists_every_command() -> None:
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        shown = subprocess.run([sys.executable, "-m", "improvo", "--help"], capture_output=True, text=True, check=True)
+        seconds.append(time.perf_counter() - start)
+    bare = []
+    for _ in range(3):
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-c", "import argparse"], check=True)
+        bare.append(time.perf_counter() - start)
+    assert min(seconds) < max(0.2, 4 * min(bare))  # a busy machine is slow for both
+    assert all(f"\n    {verb}" in shown.stdout for verb in COMMANDS)
+    for verb, command in COMMANDS.items():
+        assert all(f"\n    {part}" in help_of((verb,)) for part in command.parts), verb
+
+
+@pytest.mark.parametrize("words", WITH_PAPER, ids=" ".join)
+def test_paper_is_a_preset_of_every_step_of_the_paper(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--preset {paper}" in help_of(tuple(words))
+    assert main(["config", "-".join(words), "--preset", "paper"]) == 0
+    paper = yaml.safe_load(capsys.readouterr().out)
+    assert main(["config", "-".join(words)]) == 0
+    assert paper != yaml.safe_load(capsys.readouterr().out)
+    for section in ("odometry",):
+        if section in paper:
+            assert "paper" in paper[section].values()
+
+
+def test_flags_settings_and_files_go_over_a_preset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "c.yaml").write_text("labels: {min_observations: 7}\n")
+    words = ["--preset", "paper", "--config", str(tmp_path / "c.yaml"), "--set", "odometry.seed=3"]
+    assert main(["config", "run", *words]) == 0
+    settings = yaml.safe_load(capsys.readouterr().out)
+    assert settings["labels"]["min_observations"] == 7
+    assert settings["labels"]["quality"]["enabled"] is False
+    assert settings["odometry"]["seed"] == 3
+    assert main(["config", "run", "--preset", "papyrus"]) == 2
+    assert "choose paper" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [words for words, leaf in leaves() if leaf.settings], ids=" ".join)
+def test_printed_settings_are_the_defaults_with_their_meaning(
+    words: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["config", "-".join(words)]) == 0
+    file = tmp_path / "settings.yaml"
+    file.write_text(capsys.readouterr().out)
+    cls = settings_class(dict(leaves())[words].settings)
+    assert config.load(cls, file) == cls()
+    assert "#" in file.read_text()
+
+
+def test_comments_of_fields_are_their_help() -> None:
+    from improvo.training.settings import OptimiserSettings
+
+    found = comments(OptimiserSettings)
+    assert set(found) == {field.name for field in dataclasses.fields(OptimiserSettings)}
+    assert found["clip_norm"] == "largest L2 norm of the gradient"
+    assert found["precision"] == "auto | float32 | bfloat16"
+
+
+@pytest.mark.parametrize("words", [words for words in ALL if words not in (("demo",), ("config",))], ids=" ".join)
+def test_nothing_is_made_where_the_input_is_missing(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    needed = {
+        ("train", "shapes"): 0,
+        ("evaluate", "trajectory"): 2,
+        ("evaluate", "stability"): 2,
+        ("weights", "calibrate"): 2,
+        ("simulate",): 0,
+    }
+    inputs = [f"missing{i}" for i in range(needed.get(words, 1))]
+    output = ["-o", "new/out" if words[0] not in ("weights", "export") else "out"]
+    if words[0] == "show" or words in (("report",), ("info",)):
+        output = []
+    if words == ("weights", "show"):
+        output = []
+    if words == ("simulate",):
+        output += ["--size", "huge"]
+    if words[:1] == ("train",):
+        output += ["--from", "nobody.safetensors"]
+    assert main([*words, *inputs, *output]) == 2
+    message = capsys.readouterr().err.strip().splitlines()
+    assert len(message) == 1
+    assert message[0].startswith("improvo: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_json_is_all_that_is_printed(finished_run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    words = ["run", str(bundled_sequence()), "-o", str(tmp_path / "out"), "--frontend", "orb", "--max-frames", "12"]
+    assert main([*words, "--json"]) == 0
+    out = json.loads(capsys.readouterr().out)
+    assert out["frames"]["processed"] == 12
+    assert main([*words, "--quiet"]) == 0
+    shown = capsys.readouterr()
+    assert shown.out + shown.err == ""
+    assert main(words) == 0
+    shown = capsys.readouterr()
+    assert shown.out.splitlines()[-1].startswith("next: ")
+    assert "\r" not in shown.err
+    assert "\x1b" not in shown.out + shown.err  # no colours, with or without NO_COLOR
+
+
+def test_commands_that_end_in_figures_print_them_as_json(
+    finished_run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    truth = str(finished_run / "trajectory.txt")
+    assert main(["evaluate", "trajectory", str(finished_run), truth, "-o", str(tmp_path / "out"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["protocol"] == "trajectory"
+    assert main(["evaluate", "trajectory", str(finished_run), truth, "--quiet"]) == 0
+    assert "Absolute trajectory" in capsys.readouterr().out
+    for words, command in leaves():
+        assert ("--json" in help_of(words)) == command.figures
+
+
+def test_progress_is_a_line_now_and_then_where_there_is_no_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(terminal, "INTERVAL", 0.0)
+    with terminal.progress("label", "frame", 4) as shown:
+        shown.advance(3)
+        shown.note("no pose yet")
+        shown.advance()
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("label: 3 of 4 frames (75 %), ")
+    assert lines[0].endswith("left")
+    assert lines[1].endswith("; no pose yet")
+    with terminal.quiet(), terminal.progress("label", "frame", 4) as shown:
+        shown.advance(4)
+    assert capsys.readouterr().err == ""
+
+
+def test_settings_of_a_network_reach_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["run", str(bundled_sequence()), "-o", str(tmp_path / "out"), "--max-frames", "4"]
+    network = ["--frontend", "superpoint-small", "--precision", "float32", "--threshold", "0.02"]
+    assert main([*words, *network, "--set", "frontend.network.threads=1"]) == 0
+    configuration = json.loads((tmp_path / "out" / "run.json").read_text())["configuration"]
+    assert configuration["frontend"]["network"]["precision"] == "float32"
+    assert configuration["frontend"]["network"]["threshold"] == 0.02
+    assert config.from_dict(RunSettings, configuration).frontend.network.threads == 1
+    assert main([*words, "--frontend", "orb", "--precision", "float32"]) == 2
+    assert "not a network" in capsys.readouterr().err

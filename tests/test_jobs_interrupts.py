@@ -1,0 +1,67 @@
+"""Ctrl-C and SIGTERM are the same to a command, and neither comes in the middle of a frame."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+
+import pytest
+
+from improvo.jobs.interrupts import interrupts_wait, termination_interrupts
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+
+
+@pytest.fixture(autouse=True)
+def usual_handlers():
+    before = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    yield
+    for one, handler in before.items():
+        signal.signal(one, handler)
+
+
+def test_termination_is_an_interrupt_within_the_block() -> None:
+    with pytest.raises(KeyboardInterrupt), termination_interrupts():
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_handler_of_the_program_is_left_alone() -> None:
+    came: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, _: came.append(number))
+    with termination_interrupts():
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert came == [signal.SIGTERM]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_waits_for_the_end_of_the_block(number: int) -> None:
+    done: list[str] = []
+
+    def work() -> None:
+        with interrupts_wait():
+            os.kill(os.getpid(), number)
+            done.append("the block")
+        done.append("more")
+
+    with termination_interrupts():
+        with pytest.raises(KeyboardInterrupt):
+            work()
+        assert done == ["the block"]
+        assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
+
+
+def test_without_an_interrupt_nothing_happens() -> None:
+    with termination_interrupts(), interrupts_wait():
+        pass
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_where_interrupts_are_ignored_they_stay_so() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with interrupts_wait():
+        os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
