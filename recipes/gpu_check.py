@@ -7,7 +7,6 @@ teachers and the making of the batch), of making batches alone, and of inference
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 import time
@@ -24,6 +23,7 @@ from improvo.frontend.weights import find_weights, load_weights
 from improvo.training.device_pairs import DevicePairs
 from improvo.training.held import HeldStage
 from improvo.training.held_training import network_teacher
+from improvo.training.metrics import METRICS, read_metrics
 from improvo.training.pack import read_pack
 from improvo.training.pictures import Pictures
 from improvo.training.settings import HeldSettings
@@ -65,7 +65,7 @@ def training_rate(name: str, batches: DevicePairs, settings: HeldSettings, steps
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(HeldStage(network, settings), batches, optimiser, Path(folder))
         trainer.run(progress=False)
-        row = json.loads((Path(folder) / "metrics.jsonl").read_text().splitlines()[-1])
+        row = read_metrics(Path(folder) / METRICS)[-1]
     return 2 * settings.optimiser.batch_size / row["step_seconds"], row["loss"]
 
 
