@@ -217,10 +217,10 @@ class PairSettings:
     """Which two frames make a pair, and what is taught about them."""
 
     largest_gap: int = 60  # frames (paper, "Training Details")
-    wide_baselines: float = 0.5  # a gap is drawn with a density that rises with this power of it; 0 is uniform
+    wide_baselines: float = 0.5  # a gap is drawn with a density that rises with this power of it; 0 (paper) is uniform
     same_frame_share: float = 0.3  # of the pairs show one frame twice, where every pixel's partner is known
     replay_share: float = 0.5  # of the pairs are homography pairs of other pictures, where such are given
-    least_points: int = 16  # correspondences that two frames must have; else nearer ones are taken
+    least_points: int = 16  # points that two frames must share, else nearer ones are taken; 0 (the paper) asks for none
     points: int = 256  # correspondences taught per pair
     stability_points: int = 200  # labeled points taught per view, at most; up to half of them unstable ones
     # a cell in which no keypoint was ever followed to a neighbouring frame is taught to have none; False ignores it
@@ -230,8 +230,8 @@ class PairSettings:
 
     def __post_init__(self) -> None:
         checks = Checks(self, "pairs")
-        checks.at_least(1, "largest_gap", "least_points")
-        checks.at_least(0, "wide_baselines")
+        checks.at_least(1, "largest_gap")
+        checks.at_least(0, "wide_baselines", "least_points")
         checks.between(0, 1, "same_frame_share", "replay_share")
         checks.at_least(2, "points", "stability_points")
 

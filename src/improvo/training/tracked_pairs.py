@@ -63,7 +63,7 @@ class TrackedPairs(SeededBatches):
     ) -> None:
         super().__init__(settings)
         self.sequences, self.settings, self.replay = sequences, settings, replay
-        self.useful = [frames.useful_frames(settings.pairs.least_points) for frames in sequences]
+        self.useful = [frames.useful_frames(max(settings.pairs.least_points, 1)) for frames in sequences]
         # as with pictures: long recordings leave room for short ones
         self._cumulative = np.cumsum(np.sqrt([len(useful) for useful in self.useful]))
         taught = np.array([frames.taught_stability() for frames in sequences]).sum(axis=0)
@@ -95,6 +95,9 @@ class TrackedPairs(SeededBatches):
         a = frames.points(frame_a)
         frame_b, b = self._partner(rng, frames, frame_a, a)
         rows_a, rows_b = common_points(a, b)
+        if not len(rows_a):
+            view_a, view_b = self._anywhere(rng, frames, frame_a, a), self._anywhere(rng, frames, frame_b, b)
+            return view_a, view_b, self._two_frames(rng, view_a, view_b, rows_a, rows_b)
         middle = int(rng.integers(len(rows_a)))
         view_a = self._view(rng, frames, frame_a, a, a.points[rows_a[middle]])
         visible = inside(view_a.known.points[rows_a], self.settings.views.width, self.settings.views.height)
@@ -108,12 +111,12 @@ class TrackedPairs(SeededBatches):
         self, rng: np.random.Generator, frames: LabeledFrames, frame_a: int, a: FramePoints
     ) -> tuple[int, FramePoints]:
         """Another frame, as far away as drawn or, where too few points are common, nearer; or the same one."""
-        settings = self.settings.pairs
+        settings, last = self.settings.pairs, len(frames) - 1
         if rng.uniform() < settings.same_frame_share:
             return frame_a, a
-        gap = settings.largest_gap * rng.uniform() ** (1 / (1 + settings.wide_baselines)) * rng.choice([-1, 1])
+        gap = self._gap(rng, frame_a, last)
         while abs(gap) >= 1:
-            frame_b = int(np.clip(frame_a + round(gap), 0, len(frames) - 1))
+            frame_b = int(np.clip(frame_a + round(gap), 0, last))
             if frame_b != frame_a:
                 b = frames.points(frame_b)
                 if len(common_points(a, b)[0]) >= settings.least_points:
@@ -121,8 +124,23 @@ class TrackedPairs(SeededBatches):
             gap /= 2
         return frame_a, a
 
+    def _gap(self, rng: np.random.Generator, frame: int, last: int) -> float:
+        """Frames to another frame of a sequence that ends with frame `last`."""
+        settings = self.settings.pairs
+        if settings.wide_baselines:
+            distance = settings.largest_gap * rng.uniform() ** (1 / (1 + settings.wide_baselines))
+            return float(distance * rng.choice([-1, 1]))
+        window = np.arange(max(frame - settings.largest_gap, 0), min(frame + settings.largest_gap, last) + 1)
+        others = window[window != frame]
+        return float(rng.choice(others) - frame) if len(others) else 0.0
+
+    def _anywhere(self, rng: np.random.Generator, frames: LabeledFrames, frame: int, known: FramePoints) -> TrackedView:
+        """A view that looks at any known point of a frame."""
+        centre = known.points[rng.integers(len(known.points))] if len(known.points) else None
+        return self._view(rng, frames, frame, known, centre)
+
     def _view(
-        self, rng: np.random.Generator, frames: LabeledFrames, frame: int, known: FramePoints, centre: Float64
+        self, rng: np.random.Generator, frames: LabeledFrames, frame: int, known: FramePoints, centre: Float64 | None
     ) -> TrackedView:
         settings = self.settings
         width, height = settings.views.width, settings.views.height
