@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from improvo.cli.train_homographies import read_data_card
+from improvo.cli.train_options import read_data_card
 from improvo.frontend.quantisation import calibrate
 from improvo.frontend.weights import BUNDLED, Weights, load_weights, save_weights
 

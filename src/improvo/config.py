@@ -27,6 +27,7 @@ FORMER_NAMES: dict[str, dict[str, str]] = {
     "start": {"max_waiting": "max_buffered", "max_patience": "max_cooldown"},
     "window": {"constants": "fixed"},
     "health": {"young_frames": "provisional_frames"},
+    "pairs": {"rehearsed_share": "replay_share"},
 }
 
 
@@ -204,4 +205,6 @@ def _first_reason(error: Any) -> str:
     while getattr(error, "exceptions", None):
         error = error.exceptions[0]
         path += [str(note).rsplit(" ", 1)[-1] for note in getattr(error, "__notes__", []) if "attribute" in note]
-    return f"setting `{'.'.join(path)}`: {error}" if path else str(error)
+    where = ".".join(path)
+    named = not path or f"`{where}." in str(error) or f"`{where}`" in str(error)
+    return str(error) if named else f"setting `{where}`: {error}"

@@ -14,6 +14,7 @@ from improvo.errors import InputError
 
 if TYPE_CHECKING:
     from improvo.frontend.weights import DataSource
+    from improvo.training.pictures import Pictures
 
 
 def add_training_arguments(parser: argparse.ArgumentParser, defaults: Any, parent: str | None = None) -> None:
@@ -83,6 +84,14 @@ def starting_weights(parent: str | None) -> Path | None:
     from improvo.frontend.weights import find_weights
 
     return find_weights(parent)
+
+
+def say_skipped(pictures: Pictures) -> None:
+    """Name the pictures that could not be read."""
+    for name in pictures.skipped:
+        say(f"skipped {name}: cannot be read")
+    if pictures.skipped:
+        say(f"{len(pictures.skipped)} pictures skipped, {len(pictures)} read")
 
 
 def print_metrics(output: Path, metrics: dict[str, Any], then: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from improvo.improvement.validation import Validation, rule
 from improvo.labeling.store import DONE, read_records
 from improvo.report.improvement_page import Measure, Round, write_improvement_page
 from improvo.sequences import open_sequence
+from improvo.training.metrics import METRICS, read_metrics
 
 _LOSSES = ("loss", "detector", "descriptor", "stability")
 _PANEL = 400  # pixels, width of each of the three panels of matches
@@ -94,10 +94,7 @@ def _score_name(validation: Validation) -> str:
 
 def _training_losses(folder: Path) -> dict[str, list[float]]:
     """The rows of `metrics.jsonl`, by column; empty where nothing was trained."""
-    try:
-        rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    except FileNotFoundError:
-        return {}
+    rows = read_metrics(folder / METRICS)
     names = [name for name in rows[0] if all(name in row for row in rows)] if rows else []
     return {name: [float(row[name]) for row in rows] for name in names}
 
