@@ -26,6 +26,7 @@ _SEQUENCE_OPTIONS: dict[str, dict[str, Any]] = {
     "max_frames": {"help": "at most so many, after the stride (default: all)"},
     "width": {"metavar": "PIXELS", "help": "resize to this width (default: as recorded)"},
     "topic": {"metavar": "NAME"},
+    "mask": {"metavar": "FILE"},
 }
 
 
