@@ -24,7 +24,9 @@ def frames(count: int, read: list[int] | None = None, fails_at: int | None = Non
 
 
 def detect(frame: Frame) -> Features:
-    return Features(np.full((1, 2), frame.image[0, 0], np.float32), np.zeros((1, 4), np.float32), np.ones(1, np.float32))
+    return Features(
+        np.full((1, 2), frame.image[0, 0], np.float32), np.zeros((1, 4), np.float32), np.ones(1, np.float32)
+    )
 
 
 def match(features: Features) -> MatchedFeatures:

@@ -50,6 +50,8 @@ class SequenceMasks:
             probes = [self._files[row] for row in rows.tolist()]
         else:
             self._single, probes = chosen, [chosen]
+        for file in self._files or ():  # before any work; the sizes stand at the beginning of the files
+            self._check_size(file, size_of(file))
         used = [float(self._read(file).mean()) for file in probes]
         if max(used) == 0:
             brightest = int(_image(probes[0]).max())
@@ -74,15 +76,17 @@ class SequenceMasks:
 
     def _delivered(self, file: Path) -> Mask:
         raw = _image(file)
-        size = (raw.shape[1], raw.shape[0])
-        if size != self._size:
+        self._check_size(file, (raw.shape[1], raw.shape[0]))
+        mask = delivered_mask(raw, self._rectifier)
+        mask.flags.writeable = False
+        return mask
+
+    def _check_size(self, file: Path, size: tuple[int, int] | None) -> None:
+        if size is not None and size != self._size:
             raise InputError(
                 f"{file}: the mask is {size[0]}x{size[1]}, the images of the recording are "
                 f"{self._size[0]}x{self._size[1]}; give a mask of their size"
             )
-        mask = delivered_mask(raw, self._rectifier)
-        mask.flags.writeable = False
-        return mask
 
 
 def delivered_mask(raw: UInt8, rectifier: Rectifier) -> Mask:
@@ -91,6 +95,17 @@ def delivered_mask(raw: UInt8, rectifier: Rectifier) -> Mask:
     white = rectifier.image(np.where(raw >= _WHITE, np.uint8(255), np.uint8(0))) == 255
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BORDER + 1, 2 * BORDER + 1))
     return np.asarray(cv2.erode(white.astype(np.uint8), disc), np.bool_)  # beyond the picture nothing is black
+
+
+def size_of(file: Path) -> tuple[int, int] | None:
+    """Width and height of an image, from its header; None where that cannot be told."""
+    from PIL import Image
+
+    try:
+        with Image.open(file) as image:
+            return image.size
+    except Exception:  # Pillow raises errors of many kinds
+        return None
 
 
 def _image(file: Path) -> UInt8:
