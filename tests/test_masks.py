@@ -187,7 +187,24 @@ def test_what_never_changes_is_found(tmp_path: Path) -> None:
         assert nothing.share() == 0
     write_images(tmp_path / "plain", images(20))
     with pytest.raises(InputError, match="nothing was found"):
-        still_mask(open_recording(tmp_path / "plain"), 20)
+        still_mask(open_recording(tmp_path / "plain"), np.arange(20), 20)
+
+
+def test_info_notices_it_writes_a_mask_and_is_content_with_that(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_images(tmp_path / "seq", overlaid())
+    given = [str(tmp_path / "seq"), "--fov", "56"]
+    mask = tmp_path / "masks" / "mask.png"
+    assert main(["info", *given, "--write-mask", str(mask)]) == 0
+    text = capsys.readouterr().out
+    assert "never changes while the rest does" in text
+    assert f"--mask {mask}" in text.splitlines()[-1]
+    assert main(["info", *given, "--mask", str(mask)]) == 0
+    assert "never changes" not in capsys.readouterr().out
+    write_images(tmp_path / "plain", images(20))
+    assert main(["info", str(tmp_path / "plain"), "--fov", "56", "--write-mask", str(tmp_path / "m.png")]) == 2
+    assert not (tmp_path / "m.png").exists()
 
 
 def test_a_mask_of_another_frame_size_names_the_frame(tmp_path: Path) -> None:

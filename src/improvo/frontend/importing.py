@@ -32,9 +32,15 @@ class Layout:
     norm_epsilon: float
     names: dict[str, tuple[str, str]]  # our layer -> their convolution and batch norm
 
-    def fits(self, tensors: Tensors) -> bool:
+    def prefixes(self, tensors: Tensors) -> list[str]:
+        """What stands before this layout's names, such as `module.` or `superpoint.`, wherever all of them are."""
+        first = f"{next(iter(self.names.values()))[0]}.weight"
+        found = [name.removesuffix(first) for name in tensors if name == first or name.endswith(f".{first}")]
+        return [prefix for prefix in found if self.fits(tensors, prefix)]
+
+    def fits(self, tensors: Tensors, prefix: str = "") -> bool:
         """Whether all of its convolutions are there."""
-        return all(f"{convolution}.weight" in tensors for convolution, _ in self.names.values())
+        return all(f"{prefix}{convolution}.weight" in tensors for convolution, _ in self.names.values())
 
 
 def _plain(norms: bool) -> dict[str, tuple[str, str]]:
@@ -119,10 +125,17 @@ def convert(tensors: Tensors, source: str, licence: str) -> tuple[Weights, Layou
     Raises:
         InputError: none of the three layouts, or tensors missing from it.
     """
-    layout = next((layout for layout in reversed(LAYOUTS) if layout.fits(tensors)), None)
-    if layout is None:
+    fitting = next(((layout, found) for layout in reversed(LAYOUTS) if (found := layout.prefixes(tensors))), None)
+    if fitting is None:
         known = "; ".join(layout.name for layout in LAYOUTS)
         raise InputError(f"{source}: not a SuperPoint layout that is known here ({known}); export it in one of these")
+    layout, prefixes = fitting
+    if len(prefixes) > 1:
+        named = ", ".join(f"`{prefix}`" for prefix in prefixes)
+        raise InputError(f"{source}: holds {len(prefixes)} networks, under {named}; save the one that you mean alone")
+    tensors = {
+        name.removeprefix(prefixes[0]): values for name, values in tensors.items() if name.startswith(prefixes[0])
+    }
     try:
         ours: dict[str, Float32] = {}
         for layer, (convolution, norm) in layout.names.items():

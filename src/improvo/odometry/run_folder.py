@@ -22,6 +22,10 @@ from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, Trac
 from improvo.types import Float64, Int64, SparseMap, Trajectory, UInt8
 
 _FORMER_KINDS = {"waiting": "initialising"}  # of events
+_MENDS = {  # by a word of the reason
+    "parallax": "the camera turned or stood still: move it sideways at the start (`improvo info` shows what it sees)",
+    "match": "`improvo info` tells whether the pictures are dark, blurred or without texture",
+}
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,14 @@ class RunFolder:
         Raises:
             InputError: there is no such frame in the run or in the recording.
         """
+        return self.sequence[self._row(frame_index)].image
+
+    def colour(self, frame_index: int) -> UInt8:
+        """The same in colour, (H, W, 3) RGB; three equal channels where the recording has none."""
+        return np.ascontiguousarray(self.sequence.colour(self._row(frame_index))[..., ::-1])
+
+    def _row(self, frame_index: int) -> int:
+        """The row of the recording's sequence that a processed frame is."""
         if not 0 <= frame_index < self.frames:
             raise InputError(f"{self.path}: has no frame {frame_index}; frames are 0 to {self.frames - 1}")
         row = self._row_of_index.get(self.source_index[frame_index])
@@ -141,7 +153,7 @@ class RunFolder:
             raise InputError(
                 f"{self.sequence.path}: has no frame {self.source_index[frame_index]}; is it the recording?"
             )
-        return self.sequence[row].image
+        return row
 
     @cached_property
     def _first_rows(self) -> tuple[Int64, Int64]:
@@ -197,6 +209,16 @@ class RunFolder:
             frame_index - self.birth[rows],
             self.stability_of_rows[rows],
         )
+
+
+def why_no_pose(report: dict[str, Any]) -> str | None:
+    """Why no frame of a run has a pose, and what helps, from its run.json; None where some have."""
+    if report["frames"]["tracked"]:
+        return None
+    details = [str(event["detail"]) for event in report["events"] if event["kind"] == "initialising"]
+    reason = details[-1] if details else "the run ended before a map could start"
+    mend = next((mend for word, mend in _MENDS.items() if word in reason), _MENDS["match"])
+    return f"no frame has a pose: {reason}; {mend}"
 
 
 def _with_present_names(report: dict[str, Any]) -> dict[str, Any]:

@@ -45,7 +45,10 @@ class Record3d(Recording):
         self.times = stamps if stamped else np.arange(count) / rate
         size_numbers = numbers([metadata.get("w"), metadata.get("h")], 2)
         size = (int(size_numbers[0]), int(size_numbers[1])) if (size_numbers >= 1).all() else None
-        self.calibration, notes = median_calibration(str(path), _intrinsics(metadata, count), size=size)
+        notes: list[str] = []
+        rows = _intrinsics(metadata, count)
+        self.calibration = self.own_calibration(lambda: median_calibration(str(path), rows, size=size, notes=notes))
+        self._size = size
         depth_size = numbers([metadata.get("dw"), metadata.get("dh")], 2)
         self._depth_size = (int(depth_size[0]), int(depth_size[1])) if (depth_size >= 1).all() else None
         poses = _poses(metadata.get("poses"), count)
@@ -84,7 +87,7 @@ class Record3d(Recording):
         if len(data) != 4 * width * height:
             raise UnreadableFrameError(f"has {len(data)} bytes of depth, not {4 * width * height}")
         depth = depth_in_metres(np.frombuffer(data, "<f4").reshape(height, width), 1.0)
-        size = self.calibration.size if self.calibration is not None else None
+        size = self._size
         return depth if size is None else np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
 
     def _depth_name(self, index: int, ending: str) -> str:

@@ -18,6 +18,7 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
 from improvo.geometry.camera_files import Calibration
+from improvo.geometry.camera_files.calibration import checked
 from improvo.geometry.trajectory_files import clean_poses
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
 from improvo.sequences.images import decode, depth_in_metres
@@ -100,7 +101,8 @@ class ScanNetSens(Recording):
             raise UnreadableFrameError(f"has {len(data)} bytes of depth, not {expected}")
         values = np.frombuffer(data, "<u2").reshape(self._depth_camera.height, self._depth_camera.width)
         own = depth_in_metres(values, self._depth_scale)
-        assert self.calibration is not None
+        if self.calibration is None:
+            return own if own.shape == self._colour_size[::-1] else None
         camera = self.calibration.camera(*self._colour_size)
         return register_depth(own, self._depth_camera, camera.pinhole(), self._colour_from_depth)
 
@@ -132,8 +134,8 @@ class ScanNetSens(Recording):
         self._colour_compression, self._depth_compression = _COLOUR[colour_kind], _DEPTH.get(depth_kind)
         self._colour_size = (sizes[0], sizes[1])
         self._depth_scale = scale if np.isfinite(scale) and scale > 0 else 1000.0
-        self.calibration = Calibration(str(self.path), intrinsics_of(intrinsic_colour), size=self._colour_size)
-        self.calibration.camera(*self._colour_size)
+        published = Calibration(str(self.path), intrinsics_of(intrinsic_colour), size=self._colour_size)
+        self.calibration = self.own_calibration(lambda: checked(published))
         self._depth_camera: Camera | None = None
         usable = min(intrinsic_depth[0, 0], intrinsic_depth[1, 1]) > 0 and np.isfinite(intrinsic_depth).all()
         if sizes[2] and sizes[3] and usable:

@@ -34,7 +34,7 @@ class Sequence:
     """
 
     def __init__(self, recording: Recording, settings: SequenceSettings) -> None:
-        self.indices = _selected(recording, settings)  # (N,) rows of the recording
+        self.indices = selected(recording, settings)  # (N,) rows of the recording
         height, width = _probe(recording, self.indices).shape[:2]
         self._set_up(recording, settings, width, height)
 
@@ -50,7 +50,7 @@ class Sequence:
         if settings.width is not None and settings.width < 8:
             raise InputError(f"{self.path}: width {settings.width} is too small; choose at least 8 pixels")
         calibration = _calibration(recording, settings, width, height)
-        self._rectifier = Rectifier(calibration.camera(width, height), settings.width)
+        self._rectifier = Rectifier(calibration.camera(width, height), settings.width, settings.undistorted_fov)
         self._masks = SequenceMasks(settings.mask, recording, self.name, self._rectifier) if settings.mask else None
 
     @property
@@ -72,7 +72,10 @@ class Sequence:
     @property
     def notes(self) -> tuple[str, ...]:
         """What was odd in the recording but could be handled, one line each."""
-        return self.recording.notes
+        error = self.recording.calibration_error
+        given = "--camera" if self.settings.camera is not None else "--fov"
+        left_out = () if error is None else (f"its own calibration is left out for {given} ({_first_part(error)})",)
+        return (*self.recording.notes, *left_out)
 
     @property
     def skipped(self) -> list[SkippedFrame]:
@@ -192,7 +195,7 @@ def _image_or_reason(recording: Recording, index: int) -> tuple[UInt8 | None, st
         return None, str(error)
 
 
-def _selected(recording: Recording, settings: SequenceSettings) -> Int64:
+def selected(recording: Recording, settings: SequenceSettings) -> Int64:
     """The recording's rows that the settings ask for.
 
     Raises:
@@ -220,12 +223,19 @@ def _calibration(recording: Recording, settings: SequenceSettings, width: int, h
         return load_calibration(settings.camera)
     if settings.fov is not None:
         return from_field_of_view(settings.fov, width, height)
+    if recording.calibration_error is not None:
+        raise recording.calibration_error
     if recording.calibration is None:
         raise InputError(
             f"{recording.path}: has no calibration; give --camera FILE.yaml or fx,fy,cx,cy[,k1,k2,p1,p2,k3], "
             f"or roughly --fov DEGREES (horizontal; 60 to 75 for most phones and webcams)"
         )
     return recording.calibration
+
+
+def _first_part(error: InputError) -> str:
+    """What is wrong, without the advice."""
+    return str(error).split(";")[0]
 
 
 def _name(path: Path) -> str:

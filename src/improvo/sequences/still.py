@@ -7,12 +7,15 @@ and have the same length in every picture.
 
 from __future__ import annotations
 
+import contextlib
+
 import cv2
 import numpy as np
 
 from improvo.errors import InputError
-from improvo.sequences.base import Recording, sampled_pictures
-from improvo.types import Float32, Mask, UInt8
+from improvo.sequences.base import Recording, UnreadableFrameError
+from improvo.sequences.images import grey
+from improvo.types import Float32, Int64, Mask, UInt8
 
 _WIDTH = 320  # pixels that are looked at
 _FRAMES = 12  # fewer say nothing
@@ -50,9 +53,18 @@ class StillPixels:
         self._size = width, height
         self._count += 1
 
-    def share(self) -> float:
-        """The share of the picture; 0 where too few pictures were seen, or where nothing moves anyway."""
-        return float(self._found().mean()) if self._count else 0.0
+    def share(self, used: Mask | None = None) -> float:
+        """The share of the picture; 0 where too few pictures were seen, or where nothing moves anyway.
+
+        Args:
+            used: (H, W) what is not masked already.
+        """
+        if not self._count:
+            return 0.0
+        found = self._found()
+        if used is not None:
+            found &= cv2.resize(used.astype(np.uint8), found.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+        return float(found.mean())
 
     def mask(self) -> UInt8:
         """(H, W) as a mask: black where the picture never changes, white elsewhere."""
@@ -75,15 +87,21 @@ class StillPixels:
         return _grown(_filled(_closed(found | _touching(flat & ~found, found))), _MARGIN) if found.any() else found
 
 
-def still_mask(recording: Recording, samples: int) -> UInt8:
-    """(H, W) mask of a recording's own images, from a sample of its frames.
+def still_mask(recording: Recording, indices: Int64, samples: int) -> UInt8:
+    """(H, W) mask of a recording's own images.
+
+    Args:
+        recording: whose images.
+        indices: (N,) its frames that are used.
+        samples: so many of them are looked at.
 
     Raises:
         InputError: nothing stands still while the rest moves.
     """
     still = StillPixels()
-    for _, picture in sampled_pictures(recording, samples):
-        still.add(picture)
+    for row in np.unique(np.linspace(0, len(indices) - 1, min(samples, len(indices))).astype(int)):
+        with contextlib.suppress(UnreadableFrameError):
+            still.add(grey(recording.image(int(indices[row]))))
     if still.share() == 0:
         raise InputError(
             f"{recording.path}: nothing was found that never changes while the rest of the picture does, so no mask "

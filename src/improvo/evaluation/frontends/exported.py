@@ -23,10 +23,12 @@ class ExportedFeatures:
     """Features read from files.
 
     An image is found by the tail of its path, longest first (`redkitchen/frame-000000.color.png` before
-    `frame-000000.color.png`), by `SEQUENCE/000000` (number in the recording), or, if the export holds one sequence,
-    by `000000`. NPZ files have that name with `.npz` appended to or in place of the suffix; an HDF5 file has it as a
-    group. Keypoints (N, 2) are in pixels of the frame as delivered (undistorted, resized), centre of the top-left
-    pixel (0, 0); descriptors are (N, D), in HDF5 (D, N) as hloc writes them; scores (N,) are optional.
+    `frame-000000.color.png`), by `SEQUENCE/000000` or `SEQUENCE/000000.png` (number in the recording, as
+    `--export-images` writes it), or, if the export holds one sequence, by `000000` alone. Where the recording's own
+    names are other numbers, those are taken that more of the export fits. NPZ files have that name with `.npz` appended
+    to or in place of the suffix; an HDF5 file has it as a group. Keypoints (N, 2) are in pixels of the frame as
+    delivered (undistorted, resized), centre of the top-left pixel (0, 0); descriptors are (N, D), in HDF5 (D, N) as
+    hloc writes them; scores (N,) are optional.
     """
 
     path: str  # a folder, or an HDF5 file
@@ -62,6 +64,8 @@ class ExportedFeatures:
         """
         index = _index(self.path)
         names = candidate_names(sequence.name, frame, self.one_sequence)
+        if _is_another_number(frame) and _numbered_by_index(self.path, index, sequence):
+            names.sort(key=lambda name: PurePath(name).stem != f"{frame.source_index:06d}")
         found = next((name for name in names if name in index.names), None)
         if found is None:
             raise InputError(f"{self.path}: has no features for {frame.source} (looked for {names[0]}); export it")
@@ -94,6 +98,21 @@ def _index(path: str) -> _Index:
     return _Index(names, place.suffix in HDF5_SUFFIXES)
 
 
+def _is_another_number(frame: Frame) -> bool:
+    """Whether the frame's file is named by a number that is not that of the frame."""
+    stem = PurePath(frame.source).stem
+    return stem.isdigit() and int(stem) != frame.source_index
+
+
+@lru_cache(maxsize=16)
+def _numbered_by_index(path: str, index: _Index, sequence: Sequence) -> bool:
+    """Whether the names in an export are frame numbers, rather than the recording's own names."""
+    stems = {PurePath(name).stem for name in index.names}
+    own = sum(PurePath(sequence.recording.source(int(row))).stem in stems for row in range(len(sequence.recording)))
+    counted = sum(f"{row:06d}" in stems for row in range(len(sequence.recording)))
+    return counted > own
+
+
 def candidate_names(sequence_name: str, frame: Frame, one_sequence: bool) -> list[str]:
     """Names under which the features of a frame may be filed, most specific first.
 
@@ -110,7 +129,9 @@ def candidate_names(sequence_name: str, frame: Frame, one_sequence: bool) -> lis
     bare = [parts[-1], f"{frame.source_index:06d}"] if one_sequence else []
     names: list[str] = []
     for stem in (*numbered, *tails, *bare):
-        for name in (stem, f"{stem}.npz", str(PurePath(stem).with_suffix(".npz"))):
+        # a number alone is also filed as the picture that `--export-images` writes under it, as hloc keeps it
+        pictures = [f"{stem}{suffix}" for suffix in (".png", ".jpg")] if stem.rsplit("/", 1)[-1].isdigit() else []
+        for name in (stem, *pictures, f"{stem}.npz", str(PurePath(stem).with_suffix(".npz"))):
             if name not in names:
                 names.append(name)
     return names
