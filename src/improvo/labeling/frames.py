@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.files import written_atomically
-from improvo.types import Float64, Int64, UInt8
+from improvo.types import Float64, Int64, Mask, UInt8
 
 FRAMES_FILE = "frames.parquet"
 _FRAMES_PER_SHARD = 4096
@@ -69,32 +69,33 @@ def read_frames(path: Path) -> FramesTable:
     )
 
 
-def pack_images(folder: Path, images: Iterable[UInt8]) -> int:
-    """Write the frames, in order, as shards of JPEGs; returns how many."""
+def pack_images(folder: Path, images: Iterable[tuple[UInt8, Mask | None]]) -> int:
+    """Write the frames with their masks, in order, as shards of JPEGs and PNGs; returns how many."""
     import cv2
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    schema = pa.schema([("frame", pa.int32()), ("jpeg", pa.binary())])
-    group: list[tuple[int, bytes]] = []
+    schema = pa.schema([("frame", pa.int32()), ("jpeg", pa.binary()), ("mask", pa.binary())])
+    group: list[tuple[int, bytes, bytes | None]] = []
     writer: pq.ParquetWriter | None = None
     count = 0
 
     def flush() -> None:
         if writer is not None and group:
-            numbers, pictures = zip(*group, strict=True)
-            writer.write_table(pa.table({"frame": numbers, "jpeg": pictures}, schema))
+            numbers, pictures, masks = zip(*group, strict=True)
+            writer.write_table(pa.table({"frame": numbers, "jpeg": pictures, "mask": masks}, schema))
             group.clear()
 
     try:
-        for image in images:
+        for image, mask in images:
             if count % _FRAMES_PER_SHARD == 0:
                 flush()
                 if writer is not None:
                     writer.close()
                 writer = pq.ParquetWriter(folder / _shard_name(count), schema, compression="none")
             _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-            group.append((count, jpeg.tobytes()))
+            png = None if mask is None else cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes()
+            group.append((count, jpeg.tobytes(), png))
             count += 1
             if len(group) == _FRAMES_PER_GROUP:
                 flush()
@@ -116,20 +117,36 @@ class PackedImages:
         if not (folder / _shard_name(0)).is_file():
             raise InputError(f"{folder}: has no packed frames; label it with --pack")
         self._folder = folder
-        self._group: tuple[int, list[bytes]] = (-1, [])
+        self._group: tuple[int, list[bytes], list[bytes | None]] = (-1, [], [])
 
-    def __getitem__(self, frame: int) -> UInt8:
+    def image(self, frame: int) -> UInt8:
         """The grey image (H, W) of a frame of the processed sequence."""
         import cv2
+
+        self._read(frame)
+        jpeg = np.frombuffer(self._group[1][frame % _FRAMES_PER_GROUP], np.uint8)
+        return np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE), np.uint8)
+
+    def mask(self, frame: int) -> Mask | None:
+        """Where keypoints may be in it (H, W); None is everywhere."""
+        import cv2
+
+        self._read(frame)
+        png = self._group[2][frame % _FRAMES_PER_GROUP]
+        if png is None:
+            return None
+        return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)) > 0
+
+    def _read(self, frame: int) -> None:
+        """Have the row group of a frame at hand."""
         import pyarrow.parquet as pq
 
         number = frame // _FRAMES_PER_GROUP
         if self._group[0] != number:
             file = pq.ParquetFile(self._folder / _shard_name(frame))
-            row_group = frame % _FRAMES_PER_SHARD // _FRAMES_PER_GROUP
-            self._group = number, file.read_row_group(row_group, columns=["jpeg"])["jpeg"].to_pylist()
-        jpeg = np.frombuffer(self._group[1][frame % _FRAMES_PER_GROUP], np.uint8)
-        return np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE), np.uint8)
+            table = file.read_row_group(frame % _FRAMES_PER_SHARD // _FRAMES_PER_GROUP)
+            masks = table["mask"].to_pylist() if "mask" in table.column_names else [None] * len(table)
+            self._group = number, table["jpeg"].to_pylist(), masks
 
 
 def _shard_name(frame: int) -> str:

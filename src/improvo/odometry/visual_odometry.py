@@ -9,6 +9,7 @@ from types import TracebackType
 import numpy as np
 
 from improvo.frontend import Frontend
+from improvo.frontend.masking import features_of
 from improvo.geometry.camera import Camera
 from improvo.odometry.events import Event, EventLog
 from improvo.odometry.mapper import Mapper
@@ -100,7 +101,7 @@ class VisualOdometry:
             RuntimeError: the odometry has finished.
         """
         self._refuse_if_finished()
-        return self.track_features(self._frontend(frame.image), frame.time)
+        return self.track_features(features_of(self._frontend, frame), frame.time)
 
     def track_features(self, features: Features, time: float) -> TrackedFrame:
         """As `track`, with the features of the frame and its time in seconds at hand."""

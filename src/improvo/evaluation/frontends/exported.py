@@ -11,6 +11,7 @@ import numpy as np
 
 from improvo.errors import InputError, MissingExtraError
 from improvo.evaluation.sources import best
+from improvo.frontend.masking import without_masked
 from improvo.sequences import Sequence
 from improvo.types import Features, Frame
 
@@ -70,7 +71,8 @@ class ExportedFeatures:
             raise InputError(f"{self.path}: has no features for {frame.source} (looked for {names[0]}); export it")
         arrays = _read_hdf5(self.path, found) if index.hdf5 else _read_npz(Path(self.path) / found)
         where = f"{self.path}: {found}"
-        return best(to_features(arrays, where, (sequence.camera.width, sequence.camera.height)), self.max_keypoints)
+        exported = to_features(arrays, where, (sequence.camera.width, sequence.camera.height))
+        return best(without_masked(exported, frame.mask), self.max_keypoints)
 
 
 @dataclass(frozen=True)
