@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import openvino as ov
-from openvino import opset13 as ops
 
 from improvo.frontend.architecture import CELL, POOL_AFTER
+from improvo.frontend.openvino_library import openvino as ov
+from improvo.frontend.openvino_library import opset13 as ops
 from improvo.frontend.runtime import NetworkMaps
 from improvo.frontend.weights import Weights
 from improvo.types import Float32
