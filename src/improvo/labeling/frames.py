@@ -5,13 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.files import written_atomically
+from improvo.sequences.base import UnreadableFrameError
+from improvo.stability.tables import read_table
 from improvo.types import Float64, Int64, UInt8
+from improvo.untrusted.text import reason
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 FRAMES_FILE = "frames.parquet"
 _FRAMES_PER_SHARD = 4096
@@ -33,6 +40,14 @@ class FramesTable:
         return len(self.frame)
 
 
+def frames_schema() -> pa.Schema:
+    """One row per processed frame."""
+    import pyarrow as pa
+
+    integers = [(name, pa.int32()) for name in ("frame", "index")]
+    return pa.schema([*integers, ("time", pa.float64()), ("segment", pa.int32()), ("trusted", pa.bool_())])
+
+
 def write_frames(path: Path, frames: FramesTable) -> None:
     """Write `frames.parquet`."""
     import pyarrow as pa
@@ -46,7 +61,7 @@ def write_frames(path: Path, frames: FramesTable) -> None:
         "trusted": frames.trusted,
     }
     with written_atomically(path) as temporary:
-        pq.write_table(pa.table(columns), temporary)
+        pq.write_table(pa.table(columns, frames_schema()), temporary)
 
 
 def read_frames(path: Path) -> FramesTable:
@@ -55,15 +70,10 @@ def read_frames(path: Path) -> FramesTable:
     Raises:
         InputError: missing or damaged.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        table = pq.read_table(path, memory_map=False)
-        columns = [table[name].to_numpy() for name in ("frame", "index", "time", "segment", "trusted")]
-    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: cannot be read ({str(error).splitlines()[0]}); run `improvo label` again") from None
-    frame, index, time, segment, trusted = columns
+    table = read_table(path, frames_schema())
+    frame, index, time, segment, trusted = (table[name].to_numpy() for name in table.column_names)
+    if (np.diff(index) <= 0).any() or (frame != np.arange(len(frame))).any():
+        raise InputError(f"{path}: its frames are out of order; run `improvo label` again")
     return FramesTable(
         frame.astype(np.int64), index.astype(np.int64), time, segment.astype(np.int64), trusted.astype(np.bool_)
     )
@@ -121,15 +131,30 @@ class PackedImages:
     def __getitem__(self, frame: int) -> UInt8:
         """The grey image (H, W) of a frame of the processed sequence."""
         import cv2
-        import pyarrow.parquet as pq
+
+        from improvo.sequences.images import decode
 
         number = frame // _FRAMES_PER_GROUP
-        if self._group[0] != number:
-            file = pq.ParquetFile(self._folder / _shard_name(frame))
+        try:
+            if self._group[0] != number:
+                self._group = number, self._read(frame)
+            return np.asarray(decode(self._group[1][frame % _FRAMES_PER_GROUP], cv2.IMREAD_GRAYSCALE), np.uint8)
+        except (UnreadableFrameError, LookupError, TypeError) as error:
+            where = self._folder / _shard_name(frame)
+            raise InputError(f"{where}: frame {frame} cannot be read ({reason(error)}); label it again") from None
+
+    def _read(self, frame: int) -> list[bytes]:
+        """The pictures of the row group that a frame is in."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        path = self._folder / _shard_name(frame)
+        try:
+            file = pq.ParquetFile(path)
             row_group = frame % _FRAMES_PER_SHARD // _FRAMES_PER_GROUP
-            self._group = number, file.read_row_group(row_group, columns=["jpeg"])["jpeg"].to_pylist()
-        jpeg = np.frombuffer(self._group[1][frame % _FRAMES_PER_GROUP], np.uint8)
-        return np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE), np.uint8)
+            return list(file.read_row_group(row_group, columns=["jpeg"])["jpeg"].to_pylist())
+        except (pa.ArrowException, OSError, ValueError, LookupError, MemoryError) as error:
+            raise InputError(f"{path}: cannot be read ({reason(error)}); label it again") from None
 
 
 def _shard_name(frame: int) -> str:

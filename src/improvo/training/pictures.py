@@ -11,7 +11,10 @@ import numpy as np
 
 from improvo import terminal
 from improvo.errors import InputError
+from improvo.sequences.base import UnreadableFrameError
+from improvo.sequences.images import read_grey
 from improvo.types import Float64, UInt8
+from improvo.untrusted.text import load_yaml
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
 
@@ -107,11 +110,11 @@ def _read(path: Path, longer_side: int) -> tuple[list[UInt8], list[str], list[st
         return _read_sequence(path, longer_side)
     pictures, names, unread = [], [], []
     for file in files:
-        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        if image is None:
+        try:
+            pictures.append(_reduced(read_grey(file), longer_side))
+        except UnreadableFrameError:  # noqa: PERF203 - any file may be damaged
             unread.append(str(file))
         else:
-            pictures.append(_reduced(image, longer_side))
             names.append(file.name)
     return pictures, names, unread
 
@@ -138,7 +141,6 @@ def _reduced(image: UInt8, longer_side: int) -> UInt8:
 
 def _rotating(path: Path, count: int, shape: Sequence[int]) -> Float64 | None:
     """K·R of every picture if `groundtruth.txt` and `camera.yaml` say that the camera turns without moving."""
-    import yaml
     from scipy.spatial.transform import Rotation
 
     truth, camera = path / "groundtruth.txt", path / "camera.yaml"
@@ -146,10 +148,10 @@ def _rotating(path: Path, count: int, shape: Sequence[int]) -> Float64 | None:
         return None
     try:
         rows = np.loadtxt(truth, ndmin=2)
-        values = yaml.safe_load(camera.read_text())
+        values = load_yaml(camera.read_text())
         K = np.array([[values["fx"], 0, values["cx"]], [0, values["fy"], values["cy"]], [0, 0, 1]], np.float64)
         pinhole = not any(values.get("distortion") or ()) and (values["height"], values["width"]) == tuple(shape)
-    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
+    except (OSError, ValueError, KeyError, TypeError, OverflowError):
         return None
     if not pinhole or rows.shape != (count, 8) or np.ptp(rows[:, 1:4], axis=0).max() > 1e-9:
         return None
