@@ -30,7 +30,7 @@ from fuzz_targets import EXPECTED, Target, targets  # of the tests: run with PYT
 from mutations import mutated
 
 SECONDS, MEGABYTES = 20.0, 4000  # of one execution, of a child process
-BATCH = 200  # executions of one child
+BATCH, TURN_SECONDS = 500, 8.0  # executions of one child, at most, and how long a target's turn lasts
 PACKAGE = "improvo"
 
 
@@ -57,7 +57,7 @@ def main() -> None:
     seed = arguments.seed
     while time.monotonic() < end:
         for name in names:
-            for kind, place, number in child_results(name, seed, end):
+            for kind, place, number in child_results(name, seed, min(end, time.monotonic() + TURN_SECONDS)):
                 executions[name] += kind != "fault"
                 if kind == "fault" and f"{name}: {place}" not in faults:
                     faults[f"{name}: {place}"] = keep(name, number, arguments.corpus)

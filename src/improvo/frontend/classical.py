@@ -13,10 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from improvo.errors import ConfigError
+from improvo.errors import ConfigError, InputError
 from improvo.types import Features, Float32, Int64, UInt8
 
 _opencv: Any = cv2  # its type stubs lack the detectors' constructors
+_SMALLEST_SIDE = 8  # pixels; no detector finds anything in less, and some fail
 _ORB_CANDIDATES = 4  # times max_keypoints; ORB's own choice of the strongest clusters on few structures
 
 
@@ -45,6 +46,8 @@ class ClassicalFrontend:
     def __call__(self, image: UInt8) -> Features:
         """Features of one image (H, W) or (H, W, 3) BGR, uint8."""
         grey = to_grey(image)
+        if min(grey.shape) < _SMALLEST_SIDE:
+            return self._nothing()
         cv2.setRNGSeed(0)  # some detectors sample; the same image must give the same features
         found = self._detector.detect(grey, None)
         order, pixels = _best_first(found)
@@ -106,7 +109,15 @@ class SurfFrontend:
 
 
 def to_grey(image: UInt8) -> UInt8:
-    """(H, W) or (H, W, 3) BGR uint8 -> (H, W) uint8."""
+    """(H, W) or (H, W, 3) BGR uint8 -> (H, W) uint8.
+
+    Raises:
+        InputError: an image of another shape or type, or without pixels.
+    """
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3) or 0 in image.shape:
+        raise InputError(f"image of shape {image.shape}: give (H, W) grey or (H, W, 3) colour")
+    if image.dtype != np.uint8:
+        raise InputError(f"image of type {image.dtype}: give uint8")
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 

@@ -74,6 +74,8 @@ def candidates(reader: Any, path: Path) -> tuple[list[Stream], list[Stream]]:
     """
     pictures: list[Stream] = []
     depths: list[Stream] = []
+    if not all(isinstance(c.topic, str) and isinstance(c.msgtype, str) for c in reader.connections):
+        raise InputError(f"{path}: its metadata names topics that are no words; run `ros2 bag reindex` on it")
     for topic in sorted({c.topic for c in reader.connections if c.msgtype in _IMAGE_TYPES and c.msgcount}):
         connections = [c for c in reader.connections if c.topic == topic and c.msgtype in _IMAGE_TYPES]
         stream = Stream(reader, topic, connections, path)
