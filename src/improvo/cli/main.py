@@ -39,6 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("MPLCONFIGDIR", str(cache_folder() / "matplotlib"))  # made by matplotlib, if it is used
     try:
         arguments = parser_for(words).parse_args(words)
+        _check_paths(arguments)
         with output.configured(arguments.quiet, getattr(arguments, "json", False)), termination_interrupts():
             return int(arguments.run_command(arguments) or 0)
     except ImprovoError as error:
@@ -50,6 +51,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+
+
+def _check_paths(arguments: argparse.Namespace) -> None:
+    """Refuse a path that no system can look up, before any command does.
+
+    Raises:
+        InputError: one of them is.
+    """
+    from improvo.untrusted.paths import check_path
+
+    for value in vars(arguments).values():
+        for item in value if isinstance(value, list | tuple) else [value]:
+            if isinstance(item, Path):
+                check_path(item)
 
 
 def cache_folder() -> Path:
