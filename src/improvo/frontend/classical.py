@@ -13,11 +13,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from improvo.errors import ConfigError
+from improvo.errors import ConfigError, InputError
 from improvo.frontend.masking import check_mask, unmasked, without_masked
 from improvo.types import Features, Float32, Int64, Mask, UInt8
 
 _opencv: Any = cv2  # its type stubs lack the detectors' constructors
+_SMALLEST_SIDE = 8  # pixels; no detector finds anything in less, and some fail
 _ORB_CANDIDATES = 4  # times max_keypoints; ORB's own choice of the strongest clusters on few structures
 
 
@@ -48,6 +49,8 @@ class ClassicalFrontend:
         """Features of one image (H, W) or (H, W, 3) BGR, uint8; where there is a mask (H, W), on its True pixels."""
         grey = to_grey(image)
         check_mask(mask, grey.shape)
+        if min(grey.shape) < _SMALLEST_SIDE:
+            return self._nothing()
         cv2.setRNGSeed(0)  # some detectors sample; the same image must give the same features
         found = self._detector.detect(grey, None) if mask is None else self._detect_unmasked(grey, mask)
         order, pixels = _best_first(found)
@@ -121,7 +124,15 @@ class SurfFrontend:
 
 
 def to_grey(image: UInt8) -> UInt8:
-    """(H, W) or (H, W, 3) BGR uint8 -> (H, W) uint8."""
+    """(H, W) or (H, W, 3) BGR uint8 -> (H, W) uint8.
+
+    Raises:
+        InputError: an image of another shape or type, or without pixels.
+    """
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3) or 0 in image.shape:
+        raise InputError(f"image of shape {image.shape}: give (H, W) grey or (H, W, 3) colour")
+    if image.dtype != np.uint8:
+        raise InputError(f"image of type {image.dtype}: give uint8")
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 

@@ -41,7 +41,7 @@ class NetworkFrontend:
     """SuperPoint with a stability head behind the `Frontend` interface.
 
     Images may have any size and be grey or colour (blue-green-red, as OpenCV reads them), uint8 or float in [0, 1].
-    Not to be called from several threads at once.
+    Several threads may call it.
     """
 
     def __init__(self, weights: Weights, settings: NetworkSettings | None = None, name: str = "") -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +20,7 @@ from improvo.sequences.base import SequenceSettings
 from improvo.stability.settings import LabelSettings
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
 from improvo.types import Float64, Int64, Mask, UInt8
+from improvo.untrusted.text import read_json_file, reason
 
 if TYPE_CHECKING:
     from improvo.sequences import Sequence
@@ -61,9 +61,9 @@ class LabeledSequence:
     def camera(self) -> Camera:
         """The pinhole camera of the processed frames."""
         try:
-            return Camera(**json.loads((self.folder / RUN_FILE).read_text())["camera"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{self.folder / RUN_FILE}: cannot be read ({error}); label it again") from None
+            return Camera(**read_json_file(self.folder / RUN_FILE, "label it again")["camera"])
+        except (OSError, LookupError, TypeError, ValueError, InputError) as error:
+            raise InputError(f"{self.folder / RUN_FILE}: cannot be read ({reason(error)}); label it again") from None
 
     @cached_property
     def cam_from_world(self) -> Float64:
@@ -122,6 +122,8 @@ def read_labels(folder: Path) -> list[LabeledSequence]:
     records = read_records(folder)
     try:
         values = SettingsRecord(folder / SETTINGS_FILE).read()
+        if not isinstance(values, dict):
+            raise TypeError
         settings = config.from_dict(SequenceSettings, values["sequence"], where=str(folder / SETTINGS_FILE))
         rule = config.from_dict(LabelSettings, values["labels"], where=str(folder / SETTINGS_FILE))
     except (KeyError, TypeError):
