@@ -5,8 +5,8 @@
 
 Each row: frames with a pose, segments, ATE after Sim3 per segment as % of the true path, relative errors over 2 s,
 milliseconds per frame of the frontend and of everything else (one thread each; `improvo run` overlaps the two), and
-whether the run is silently wrong: a segment with over 5 % of ATE and no alarm of the two-view check. Where a recording's
-folder has `truth-sfm.txt`, that is the truth (--own-truth: not); the odometry keeps the recording's own camera.
+whether the run is silently wrong: a segment with over 5 % of ATE and no alarm of the two-view check. Where a folder has
+`truth-sfm.txt`, that is the truth (--own-truth: not); the odometry keeps the recording's own camera.
 """
 
 from __future__ import annotations
