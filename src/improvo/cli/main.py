@@ -100,9 +100,7 @@ def parser_for(words: Sequence[str]) -> argparse.ArgumentParser:
     return parser
 
 
-def _add_commands(
-    parsers: argparse._SubParsersAction[argparse.ArgumentParser], commands: dict[str, Command], named: list[str]
-) -> None:
+def _add_commands(parsers: argparse._SubParsersAction[_Parser], commands: dict[str, Command], named: list[str]) -> None:
     for name, command in commands.items():
         chosen = named[:1] == [name]
         leaf = chosen and not command.parts

@@ -31,13 +31,9 @@ class SequenceSettings:
     end: int | None = None  # one past the last frame of the recording
     stride: int = 1  # every n-th frame
     max_frames: int | None = None  # after the stride
-    undistorted_fov: float | None = (
-        None  # degrees that the view of a wide lens shows; None keeps the resolution of the centre
-    )
+    undistorted_fov: float | None = None  # degrees of a wide lens to show; None keeps the centre's resolution
     width: int | None = None  # resize to this width, keeping the aspect ratio
-    mask: str | None = (
-        None  # one image for all frames, or a folder with one per frame; white pixels are used, black ones not
-    )
+    mask: str | None = None  # one image for all frames, or a folder with one per frame; only white pixels are used
     topic: str | None = None  # the image topic of a ROS bag, or the camera of a recording with several (cam1, image_3)
 
 
