@@ -48,7 +48,7 @@ PAPER = preset(OdometryTrainingSettings, "paper")
 
 
 class GreyFrames:
-    """Frames of one grey level each, their own number; each knows twenty points, which no two frames share if `apart`."""
+    """Frames of one grey level each, their number; each knows 20 points, which no two frames share if `apart`."""
 
     size = (96, 72)
 
