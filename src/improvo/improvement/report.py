@@ -201,7 +201,9 @@ def _draw_matches(
     if len(pairs) == 0:
         raise InputError(f"{part.paths[0]}: too short for a pair")
     a, b = (int(row) for row in pairs[len(pairs) // 2])
-    picture = paint_matches(frontend, sequence[a].image, sequence[b].image, None, sequence.camera, width=_PANEL)
+    first, second = sequence[a], sequence[b]
+    masks = first.mask, second.mask
+    picture = paint_matches(frontend, first.image, second.image, None, sequence.camera, width=_PANEL, masks=masks)
     write_png(target, picture)
 
 
@@ -213,8 +215,8 @@ def _draw_stability(
 
     frontend = load_network_frontend(candidate.weights, max_keypoints=settings.frontend.max_keypoints)
     sequence = open_sequence(part.paths[0], part.sequence)
-    image = sequence[len(sequence) // 2].image
-    write_png(target, paint_stability(image, frontend, candidate.name, width=_SINGLE))
+    frame = sequence[len(sequence) // 2]
+    write_png(target, paint_stability(frame.image, frontend, candidate.name, width=_SINGLE, mask=frame.mask))
 
 
 def _draw_labels(

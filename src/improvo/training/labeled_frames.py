@@ -12,13 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from improvo.frontend.masking import unmasked
 from improvo.geometry.se3 import transform
 from improvo.labeling.labeled import LabeledSequence
 from improvo.stability.grouping import medians, rows_of
 from improvo.stability.rule import IGNORE, STABLE, UNSTABLE
 from improvo.training.settings import LandmarkSettings
 from improvo.training.wrong_links import largest_step_shares
-from improvo.types import Float32, Float64, Int64, UInt8
+from improvo.types import Float32, Float64, Int64, Mask, UInt8
 
 Codes = NDArray[np.int8]
 
@@ -62,6 +63,13 @@ class LabeledFrames:
         if (image.shape[1], image.shape[0]) == self.size:
             return image
         return np.asarray(cv2.resize(image, self.size, interpolation=cv2.INTER_AREA), np.uint8)
+
+    def mask(self, frame: int) -> Mask | None:
+        """Which pixels of the training picture (H, W) are used; None are all."""
+        mask = self.sequence.mask(frame)
+        if mask is None:
+            return None
+        return np.asarray(cv2.resize(mask.astype(np.uint8) * 255, self.size, interpolation=cv2.INTER_AREA) == 255)
 
     def useful_frames(self, least: int) -> Int64:
         """Frames whose tracks have at least `least` stable points."""
@@ -193,6 +201,9 @@ class LabeledFrames:
         seen_alike = cosine >= np.cos(np.radians(settings.largest_view_angle_degrees))
         seen_alike &= (ratio <= settings.largest_distance_ratio) & (ratio >= 1 / settings.largest_distance_ratio)
         kept = np.flatnonzero(inside & seen_alike)
+        mask = self.sequence.mask(frame)
+        if mask is not None:
+            kept = kept[unmasked(pixels[kept].astype(np.float32), mask)]
         kept = kept[~self._hidden(frame, seen, pixels[kept], depth[kept])]
         return rows[kept], pixels[kept]
 

@@ -13,6 +13,8 @@ from improvo import terminal
 from improvo.errors import InputError
 from improvo.geometry.camera_files import folder_calibration
 from improvo.geometry.trajectory_files import read_trajectory
+from improvo.sequences.base import UnreadableFrameError
+from improvo.sequences.images import read_grey
 from improvo.types import Float64, UInt8
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
@@ -111,11 +113,11 @@ def _read(path: Path, longer_side: int) -> tuple[list[UInt8], list[str], list[st
         return _read_sequence(path, longer_side)
     pictures, names, unread = [], [], []
     for file in files:
-        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        if image is None:
+        try:
+            pictures.append(_reduced(read_grey(file), longer_side))
+        except UnreadableFrameError:  # noqa: PERF203 - any file may be damaged
             unread.append(str(file))
         else:
-            pictures.append(_reduced(image, longer_side))
             names.append(file.name)
     return pictures, names, unread
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from improvo.frontend.masking import unmasked
 from improvo.stability.rule import STABLE, UNSTABLE
 from improvo.training.labeled_frames import FramePoints, LabeledFrames, common_points
 from improvo.training.labels import DUSTBIN, IGNORED, label_cells
@@ -30,6 +32,7 @@ class TrackedView:
     cells: Int64  # (Hc, Wc) see `label_cells`
     known: FramePoints  # of the frame; `points` in pixels of the view, NaN or outside where not visible
     view_from_frame: Float64  # (3, 3)
+    used: NDArray[np.bool_] | None = None  # (H, W) what shows the frame and is not masked; None without a mask
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,9 @@ class TrackedPairs(SeededBatches):
         picture = frames.picture(frame)
         H = random_view(rng, settings.views, frames.size, centre)
         image = augment(warp_image(picture, H, width, height), rng, settings.photometric)
-        visible = cv2.warpPerspective(np.ones_like(picture), H, (width, height), flags=cv2.INTER_NEAREST) > 0
+        mask = frames.mask(frame)
+        used = np.ones_like(picture) if mask is None else mask.astype(np.uint8)
+        visible = cv2.warpPerspective(used, H, (width, height), flags=cv2.INTER_NEAREST) > 0
         points = warp_points(H, known.points)
         # the detector loss ignores the cells of unstable and unknown points
         agreement = np.where(known.stability == STABLE, _CERTAIN, _UNDECIDED).astype(np.float32)
@@ -156,7 +161,7 @@ class TrackedPairs(SeededBatches):
             cells[:] = IGNORED
         if not settings.pairs.untracked_is_background:
             cells[cells == DUSTBIN] = IGNORED
-        return TrackedView(image, cells, replace(known, points=points), H)
+        return TrackedView(image, cells, replace(known, points=points), H, None if mask is None else visible)
 
     def _two_frames(
         self, rng: np.random.Generator, a: TrackedView, b: TrackedView, rows_a: Int64, rows_b: Int64
@@ -189,6 +194,7 @@ class TrackedPairs(SeededBatches):
         frame_from_a = np.linalg.inv(a.view_from_frame)
         places_b = warp_points(b.view_from_frame @ frame_from_a, result.a)
         result.valid[:] = inside(places_b, width, height) & inside(warp_points(frame_from_a, result.a), *size)
+        result.valid[:] &= _on(a.used, result.a) & _on(b.used, places_b)
         result.b[:] = np.where(result.valid[:, None], places_b, 0)
         result.negative[:] = result.valid
         return result
@@ -211,6 +217,14 @@ def _unlabeled(view: View) -> TrackedView:
     """A view of a picture of which no stability is known."""
     nothing = FramePoints(np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int8), np.zeros(0, np.bool_))
     return TrackedView(view.image, view.cells, nothing, view.view_from_picture)
+
+
+def _on(used: NDArray[np.bool_] | None, points: NDArray[Any]) -> NDArray[np.bool_]:
+    """(N,) whether points (N, 2) lie on used pixels; NaN does not, nor what lies outside a mask."""
+    known = np.isfinite(points).all(axis=1)
+    if used is None:
+        return np.asarray(known)
+    return np.asarray(known & unmasked(np.where(known[:, None], points, -1).astype(np.float32), used))
 
 
 def _empty(count: int) -> Correspondences:
