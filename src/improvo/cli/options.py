@@ -31,6 +31,7 @@ _SEQUENCE_OPTIONS: dict[str, dict[str, Any]] = {
     },
     "width": {"metavar": "PIXELS", "help": "resize to this width (default: as recorded)"},
     "topic": {"metavar": "NAME"},
+    "mask": {"metavar": "FILE"},
 }
 
 

@@ -6,6 +6,7 @@ import codecs
 from pathlib import Path
 
 from improvo.errors import InputError
+from improvo.untrusted.limits import MAX_TEXT_BYTES
 
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
@@ -28,8 +29,10 @@ def read_text(path: Path, what: str = "text", mend: str = "save it as UTF-8") ->
         InputError: it cannot be read, or is no text.
     """
     try:
+        if path.stat().st_size > MAX_TEXT_BYTES:
+            raise InputError(f"{path}: cannot be read as {what} (it is too large); {mend}")
         return decoded(path.read_bytes())
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError, MemoryError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not a text file"
         raise InputError(f"{path}: cannot be read as {what} ({reason}); {mend}") from None
 

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from improvo.files import make_output_folder
+from improvo.folder_lock import locked
 from improvo.frontend.weights import load_weights, save_weights
-from improvo.improvement.folder import Candidate, ImproveFolder
+from improvo.improvement.folder import COMMAND, Candidate, ImproveFolder
 from improvo.improvement.progress import ImprovementProgress
 from improvo.improvement.report import write_report
 from improvo.improvement.rounds import Rounds, Train, starting_weights
@@ -65,36 +67,37 @@ def improve(
     Raises:
         InputError: nothing could be labelled, or weights that cannot be read.
         ConfigError: the folder was begun with other settings.
-        OutputError: the folder is not ours, or cannot be written (full disk).
+        OutputError: the folder is not ours, another process is at work there, or it cannot be written (full disk).
     """
     progress = progress or ImprovementProgress()
     first_weights = starting_weights(settings.frontend.name)
-    folder = ImproveFolder(output, sequences, evaluate, settings, first_weights)
-    loop = Rounds(folder, settings, train or _train_odometry, data, workers, ray, progress)
-
-    split = loop.split(sequences, evaluate, first_weights)
-    progress.split(split)
-    start = loop.start(first_weights, split.training)
-    result = Improvement(folder.weights, 0, (start,), (loop.validate(start, split.held_back),))
-    progress.validated(start, result.validations[0], result.validations[0], better=None)
-    _keep(result, folder, split, settings)
-    for number in range(1, max(rounds, folder.finished_rounds()) + 1):
-        teacher = result.candidates[result.best]
-        candidate = folder.round(number)
-        if not candidate.validation.is_file():
-            loop.label(teacher, split.training)
-            loop.train(candidate, number, teacher, split.training)
-        validation = loop.validate(candidate, split.held_back)
-        better = is_better(validation, result.validations[result.best], settings.validation)
-        progress.validated(candidate, validation, result.validations[0], better)
-        result = Improvement(
-            folder.weights,
-            number if better else result.best,
-            (*result.candidates, candidate),
-            (*result.validations, validation),
-        )
+    make_output_folder(output, COMMAND)
+    with locked(output):
+        folder = ImproveFolder(output, sequences, evaluate, settings, first_weights)
+        loop = Rounds(folder, settings, train or _train_odometry, data, workers, ray, progress)
+        split = loop.split(sequences, evaluate, first_weights)
+        progress.split(split)
+        start = loop.start(first_weights, split.training)
+        result = Improvement(folder.weights, 0, (start,), (loop.validate(start, split.held_back),))
+        progress.validated(start, result.validations[0], result.validations[0], better=None)
         _keep(result, folder, split, settings)
-    return result
+        for number in range(1, max(rounds, folder.finished_rounds()) + 1):
+            teacher = result.candidates[result.best]
+            candidate = folder.round(number)
+            if not candidate.validation.is_file():
+                loop.label(teacher, split.training)
+                loop.train(candidate, number, teacher, split.training)
+            validation = loop.validate(candidate, split.held_back)
+            better = is_better(validation, result.validations[result.best], settings.validation)
+            progress.validated(candidate, validation, result.validations[0], better)
+            result = Improvement(
+                folder.weights,
+                number if better else result.best,
+                (*result.candidates, candidate),
+                (*result.validations, validation),
+            )
+            _keep(result, folder, split, settings)
+        return result
 
 
 def _keep(result: Improvement, folder: ImproveFolder, split: Split, settings: ImproveSettings) -> None:

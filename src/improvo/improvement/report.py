@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from improvo.improvement.validation import Validation, rule
 from improvo.labeling.store import DONE, read_records
 from improvo.report.improvement_page import Measure, Round, write_improvement_page
 from improvo.sequences import open_sequence
+from improvo.training.metrics import METRICS, read_metrics
 
 _LOSSES = ("loss", "detector", "descriptor", "stability")
 _PANEL = 400  # pixels, width of each of the three panels of matches
@@ -94,10 +94,7 @@ def _score_name(validation: Validation) -> str:
 
 def _training_losses(folder: Path) -> dict[str, list[float]]:
     """The rows of `metrics.jsonl`, by column; empty where nothing was trained."""
-    try:
-        rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    except FileNotFoundError:
-        return {}
+    rows = read_metrics(folder / METRICS)
     names = [name for name in rows[0] if all(name in row for row in rows)] if rows else []
     return {name: [float(row[name]) for row in rows] for name in names}
 
@@ -204,7 +201,9 @@ def _draw_matches(
     if len(pairs) == 0:
         raise InputError(f"{part.paths[0]}: too short for a pair")
     a, b = (int(row) for row in pairs[len(pairs) // 2])
-    picture = paint_matches(frontend, sequence[a].image, sequence[b].image, None, sequence.camera, width=_PANEL)
+    first, second = sequence[a], sequence[b]
+    masks = first.mask, second.mask
+    picture = paint_matches(frontend, first.image, second.image, None, sequence.camera, width=_PANEL, masks=masks)
     write_png(target, picture)
 
 
@@ -216,8 +215,8 @@ def _draw_stability(
 
     frontend = load_network_frontend(candidate.weights, max_keypoints=settings.frontend.max_keypoints)
     sequence = open_sequence(part.paths[0], part.sequence)
-    image = sequence[len(sequence) // 2].image
-    write_png(target, paint_stability(image, frontend, candidate.name, width=_SINGLE))
+    frame = sequence[len(sequence) // 2]
+    write_png(target, paint_stability(frame.image, frontend, candidate.name, width=_SINGLE, mask=frame.mask))
 
 
 def _draw_labels(

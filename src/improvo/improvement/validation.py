@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from improvo.errors import InputError
+from improvo import config
+from improvo.errors import ConfigError, InputError
 from improvo.evaluation.pose.pairs import draw_pairs
 from improvo.evaluation.pose.unlabelled import Survival, surviving_matches, usable_gaps
 from improvo.evaluation.settings import PoseSettings
@@ -28,6 +27,7 @@ from improvo.labeling.labeled import LabeledSequence, read_labels
 from improvo.labeling.store import DONE, SequenceRecord
 from improvo.sequences import Sequence, open_sequence
 from improvo.stability.rule import IGNORE
+from improvo.untrusted.text import read_json_file
 
 _RESAMPLES, _CONFIDENCE = 1000, 0.95
 
@@ -126,12 +126,20 @@ def read_validation(path: Path) -> Validation:
     Raises:
         InputError: it is damaged.
     """
+    mend = "remove it, and it is measured again"
+    values = read_json_file(path, mend)
+    error = values.get("error", 0.0)
     try:
-        values: dict[str, Any] = json.loads(path.read_text())
-        error = float("nan") if values["error"] is None else values["error"]
-        return Validation(**{**values, "error": error, "failures": tuple(values["failures"])})
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: is damaged; remove it, and it is measured again") from None
+        found = config.from_dict(Validation, {**values, "error": float("nan") if error is None else error})
+        whole = bool(found.agreeing) and found.agreeing.keys() == found.share.keys()
+        whole &= all(gap.isdecimal() and len(gap) < 9 for gap in found.agreeing)
+        whole &= {"label", "evaluate"} <= found.seconds.keys()
+        numbers = [found.track_length, found.stable_share, *found.share.values(), *found.pose.values()]
+        if not (whole and np.isfinite(numbers).all()):
+            raise ConfigError("values that do not belong together")
+    except ConfigError:
+        raise InputError(f"{path}: is damaged; {mend}") from None
+    return found
 
 
 def validate(

@@ -33,6 +33,7 @@ class SequenceSettings:
     max_frames: int | None = None  # after the stride
     undistorted_fov: float | None = None  # degrees of a wide lens that are seen; None keeps the middle's resolution
     width: int | None = None  # resize to this width, keeping the aspect ratio
+    mask: str | None = None  # an image for all frames, or a folder with one for each; white is used, black is not
     topic: str | None = None  # the image topic of a ROS bag, or the camera of a recording with several (cam1, image_3)
 
 

@@ -101,7 +101,7 @@ def _read_images(folder: Path) -> tuple[Float64, list[Path], list[str]]:
     if table.is_file():
         for number, line in enumerate(read_text(table, "a list of images", "copy it again").splitlines()):
             fields = [field.strip() for field in re.split(r"[,;\s]+", line.strip())]
-            if not line.strip() or line.startswith("#") or (number == 0 and not fields[0].isdigit()):
+            if not line.strip() or line.startswith("#") or (number == 0 and not fields[0].isdecimal()):
                 continue
             if len(fields) >= 2 and re.fullmatch(r"\d{1,19}", fields[0]) and fields[1]:
                 rows.append((int(fields[0]), listed_file(folder / "data", fields[1])))

@@ -20,6 +20,7 @@ from improvo.sequences.image_files import ImageFiles
 from improvo.sequences.images import list_images, listed_file, read_depth
 from improvo.sequences.rates import depth_scale
 from improvo.types import Float32, Trajectory, UInt8
+from improvo.untrusted.names import number_of
 
 DEPTH_SCALE = 5000.0
 FPS = 30.0
@@ -83,8 +84,8 @@ def _associations(path: Path) -> dict[int, tuple[Path, Path | None]]:
                 frames[int(float(pair["rgb"][0]))] = (listed_file(path, pair["rgb"][1]), depth)
     if not frames:
         for file in list_images(path / "rgb"):
-            if file.stem.isdigit():
-                frames[int(file.stem)] = (file, path / "depth" / f"{file.stem}.png")
+            if (number := number_of(file.stem)) is not None:
+                frames[number] = (file, path / "depth" / f"{file.stem}.png")
     return frames
 
 

@@ -13,6 +13,9 @@ import numpy as np
 from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.grey_levels import to_8_bits
 from improvo.types import Float32, UInt8
+from improvo.untrusted.limits import MAX_PICTURE_BYTES
+from improvo.untrusted.pictures import check_picture
+from improvo.untrusted.text import reason
 
 IMAGE_SUFFIXES = frozenset(
     {".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".pnm", ".jp2"}
@@ -32,6 +35,15 @@ def read_image(path: Path) -> UInt8:
         UnreadableFrameError: missing, truncated, or not an image.
     """
     return to_8_bits(decode(file_bytes(path), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH))
+
+
+def read_grey(path: Path) -> UInt8:
+    """(H, W) grey, 8 bits.
+
+    Raises:
+        UnreadableFrameError: missing, truncated, or not an image.
+    """
+    return np.asarray(decode(file_bytes(path), cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
 def read_depth(path: Path, scale: float) -> Float32:
@@ -64,6 +76,10 @@ def decode(data: bytes, flags: int) -> np.ndarray:
     """
     if not data:
         raise UnreadableFrameError("the file is empty")
+    try:
+        check_picture(data)
+    except ValueError as error:
+        raise UnreadableFrameError(str(error)) from None
     if data.startswith(b"\xff\xd8"):
         return _decode_jpeg(data, flags)
     if data.startswith(b"\x89PNG"):
@@ -105,7 +121,7 @@ def _is_whole(data: bytes) -> bool:
 def _decoded(data: bytes, flags: int) -> np.ndarray:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:
+    except (cv2.error, MemoryError):
         image = None
     if image is None or image.size == 0:
         raise UnreadableFrameError("not a readable image")
@@ -172,8 +188,10 @@ def listed_file(folder: Path, name: str) -> Path:
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:
-    """Sorts numbers in names by value."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name) if part]
+    """Sorts numbers in names by value, however long they are."""
+    parts = [part for part in re.split(r"(\d+)", name) if part]
+    digits = [part.lstrip("0") if part.isdecimal() else "" for part in parts]
+    return [(len(n), n) if part.isdecimal() else (-1, part) for part, n in zip(parts, digits, strict=True)]
 
 
 def file_bytes(path: Path) -> bytes:
@@ -183,6 +201,8 @@ def file_bytes(path: Path) -> bytes:
         UnreadableFrameError: it cannot be read.
     """
     try:
+        if path.stat().st_size > MAX_PICTURE_BYTES:
+            raise UnreadableFrameError("the file is too large for a picture")
         return path.read_bytes()
-    except OSError as error:
-        raise UnreadableFrameError(error.strerror or str(error)) from None
+    except (OSError, ValueError, MemoryError) as error:
+        raise UnreadableFrameError(reason(error)) from None

@@ -20,6 +20,7 @@ from improvo.sequences.base import Recording, SequenceSettings
 from improvo.sequences.image_files import ImageFiles
 from improvo.sequences.images import list_images
 from improvo.types import Float64, Trajectory, UInt8
+from improvo.untrusted.names import number_of
 
 FPS = 10.0
 EARTH_RADIUS = 6378137.0  # metres
@@ -86,11 +87,13 @@ def _inertial_poses(folder: Path, day: Path, number: str) -> tuple[Trajectory | 
         times, _ = read_times(folder / "timestamps.txt")
     except InputError as error:
         return None, [f"{folder}: is left out, so there is no ground truth ({str(error).split(';')[0]})"]
-    files = sorted(file for file in (folder / "data").iterdir() if file.suffix == ".txt" and file.stem.isdigit())
-    files = [file for file in files if int(file.stem) < len(times)]
-    if not files:
+    files = sorted(file for file in (folder / "data").iterdir() if file.suffix == ".txt")
+    numbered = [(number_of(file.stem), file) for file in files]
+    known = [(number, file) for number, file in numbered if number is not None and number < len(times)]
+    if not known:
         return None, []
-    rows = np.array([_oxts_row(file) for file in files])
+    numbers = [number for number, _ in known]
+    rows = np.array([_oxts_row(file) for _, file in known])
     scale = np.cos(np.radians(rows[0, 0]))
     east = scale * np.radians(rows[:, 1]) * EARTH_RADIUS
     north = scale * EARTH_RADIUS * np.log(np.tan(np.radians(90 + rows[:, 0]) / 2))
@@ -99,8 +102,8 @@ def _inertial_poses(folder: Path, day: Path, number: str) -> tuple[Trajectory | 
     turn = [so3_exp(rows[:, 3 + axis, None] * axes[axis]) for axis in range(3)]  # roll, pitch, yaw
     world_from_imu = rigid(turn[2] @ turn[1] @ turn[0], place - place[0])
     poses = clean_poses(world_from_imu @ inverse(cam_from_imu))[0]
-    order, _ = increasing_order(times[[int(file.stem) for file in files]])
-    stamps = times[[int(file.stem) for file in files]][order]
+    order, _ = increasing_order(times[numbers])
+    stamps = times[numbers][order]
     return (Trajectory(stamps, poses[order]) if np.isfinite(poses).any() else None), []
 
 

@@ -16,6 +16,7 @@ from improvo.sequences.live import LiveStream, is_live
 from improvo.sequences.live_sequence import LiveSequence
 from improvo.sequences.sequence import Sequence, selected
 from improvo.types import Trajectory
+from improvo.untrusted.paths import check_path
 
 ENTRY_POINT = "improvo.recordings"  # the group under which other packages offer their readers
 
@@ -74,9 +75,22 @@ def true_trajectory(path: Path | str, settings: SequenceSettings | None = None, 
 def open_recording(path: Path | str, settings: SequenceSettings | None = None, **overrides: Any) -> Recording:
     """The recording as it lies on disk: raw images, needs no calibration. Arguments and errors as `open_sequence`."""
     settings = _with_overrides(settings, overrides)
-    path = Path(path)
+    path = check_path(Path(path))
     if settings.fps is not None and not settings.fps > 0:
         raise InputError(f"{path}: fps {settings.fps:g} must be positive")
+    try:
+        return _recording(path, settings)
+    except UnreadableFrameError as error:
+        raise InputError(f"{path}: {error}; copy or export the recording again") from None
+    except MemoryError:
+        raise InputError(f"{path}: needs more memory than there is; cut it into parts") from None
+    except OSError as error:
+        raise InputError(
+            f"{error.filename or path}: {error.strerror or error}; check the path and permissions"
+        ) from None
+
+
+def _recording(path: Path, settings: SequenceSettings) -> Recording:
     live = is_live(str(path))
     if not live and not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
@@ -93,14 +107,7 @@ def open_recording(path: Path | str, settings: SequenceSettings | None = None, *
             )
     else:
         chosen = _format(settings.format)
-    try:
-        return chosen(path, settings)
-    except UnreadableFrameError as error:
-        raise InputError(f"{path}: {error}; copy or export the recording again") from None
-    except OSError as error:
-        raise InputError(
-            f"{error.filename or path}: {error.strerror or error}; check the path and permissions"
-        ) from None
+    return chosen(path, settings)
 
 
 def _unread_pictures(path: Path) -> str | None:

@@ -22,6 +22,7 @@ from improvo.sequences.images import list_images, read_depth
 from improvo.sequences.rates import frame_rate
 from improvo.sequences.registration import intrinsics_of, register_depth, relative_extrinsics
 from improvo.types import Float32, Float64, Trajectory, UInt8
+from improvo.untrusted.names import number_of
 
 DEPTH_SCALE = 1000.0
 FPS = 30.0
@@ -163,7 +164,8 @@ def _info_file(path: Path) -> Path | None:
 
 
 def _numbered(path: Path) -> list[Path]:
-    return [file for file in list_images(path) if ".color." in file.name and file.name.split(".")[0][6:].isdigit()]
+    pictures = [file for file in list_images(path) if ".color." in file.name]
+    return [file for file in pictures if number_of(file.name.split(".")[0][6:]) is not None]
 
 
 def _first(*files: Path) -> Path | None:

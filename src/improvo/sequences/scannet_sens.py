@@ -24,6 +24,8 @@ from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameE
 from improvo.sequences.images import decode, depth_in_metres
 from improvo.sequences.registration import intrinsics_of, register_depth, relative_extrinsics
 from improvo.types import Float32, Int64, Trajectory, UInt8
+from improvo.untrusted.decompression import decompress
+from improvo.untrusted.limits import MAX_PICTURE_BYTES
 
 FPS = 30.0
 _FRAME = struct.Struct("<16f4Q")  # camera-to-world, colour and depth time, colour and depth bytes
@@ -32,6 +34,7 @@ _SIZES = struct.Struct("<2i4IfQ")  # compressions, colour and depth sizes, depth
 _COLOUR = {0: "raw", 1: "png", 2: "jpeg"}
 _DEPTH = {0: "raw", 1: "zlib"}
 _MAX_SIDE = 16384
+_DEFLATED = 1100  # bytes that one byte of zlib can become, at most
 
 
 class ScanNetSens(Recording):
@@ -92,10 +95,12 @@ class ScanNetSens(Recording):
             return None
         data = self._bytes(int(self._offsets[index] + self._colour_bytes[index]), size)
         expected = 2 * self._depth_camera.width * self._depth_camera.height
+        if expected > _DEFLATED * size:
+            raise UnreadableFrameError(f"has {size} bytes for {expected} bytes of depth")
         if self._depth_compression == "zlib":
             try:
-                data = zlib.decompressobj().decompress(data, expected + 1)
-            except zlib.error:
+                data = decompress(zlib.decompressobj, data, expected)
+            except (zlib.error, ValueError):
                 raise UnreadableFrameError("the depth cannot be decompressed") from None
         if len(data) != expected:
             raise UnreadableFrameError(f"has {len(data)} bytes of depth, not {expected}")
@@ -107,6 +112,8 @@ class ScanNetSens(Recording):
         return register_depth(own, self._depth_camera, camera.pinhole(), self._colour_from_depth)
 
     def _bytes(self, offset: int, count: int) -> bytes:
+        if count > MAX_PICTURE_BYTES:
+            raise UnreadableFrameError(f"has {count} bytes, too many for a picture")
         self._file.seek(offset)
         data = self._file.read(count)
         if len(data) != count:

@@ -15,8 +15,9 @@ from improvo.geometry.camera_files import Calibration, from_field_of_view, load_
 from improvo.sequences.association import poses_at
 from improvo.sequences.base import Recording, SequenceSettings, SkippedFrame, UnreadableFrameError
 from improvo.sequences.images import grey
+from improvo.sequences.mask import SequenceMasks
 from improvo.sequences.rectification import Rectifier
-from improvo.types import Float32, Float64, Frame, Int64, Trajectory, UInt8
+from improvo.types import Float32, Float64, Frame, Int64, Mask, Trajectory, UInt8
 
 _PROBES = 20  # frames tried for the image size before a recording counts as unreadable
 
@@ -50,6 +51,7 @@ class Sequence:
             raise InputError(f"{self.path}: width {settings.width} is too small; choose at least 8 pixels")
         calibration = _calibration(recording, settings, width, height)
         self._rectifier = Rectifier(calibration.camera(width, height), settings.width, settings.undistorted_fov)
+        self._masks = SequenceMasks(settings.mask, recording, self.name, self._rectifier) if settings.mask else None
 
     @property
     def camera(self) -> Camera:
@@ -64,7 +66,8 @@ class Sequence:
     @property
     def view(self) -> str:
         """What was done to the images, for a person: undistortion with its crop, resize."""
-        return self._rectifier.description
+        description = self._rectifier.description
+        return description if self._masks is None else f"{description}, {self._masks.description}"
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -149,6 +152,13 @@ class Sequence:
         colourless = raw.ndim == 2 or raw.shape[2] == 1
         return self._rectifier.image(cv2.cvtColor(grey(raw), cv2.COLOR_GRAY2BGR) if colourless else raw[..., :3])
 
+    def mask(self, i: int) -> Mask | None:
+        """Where keypoints may be in the i-th selected frame (H, W); None is everywhere."""
+        return self._mask(int(self.indices[i]))
+
+    def _mask(self, index: int) -> Mask | None:
+        return None if self._masks is None else self._masks[index]
+
     def _frame(self, index: int) -> Frame | None:
         source = self.recording.source(index)
         try:
@@ -156,7 +166,7 @@ class Sequence:
         except UnreadableFrameError as error:
             self._skipped[index] = SkippedFrame(index, source, str(error))
             return None
-        return Frame(index, float(self.recording.times[index]), self._rectifier.image(image), source)
+        return Frame(index, float(self.recording.times[index]), self._rectifier.image(image), source, self._mask(index))
 
     def _raw_image(self, index: int) -> UInt8:
         image = self.recording.image(index)

@@ -11,7 +11,7 @@ from improvo.sequences.sequence import Sequence
 
 DARK, BRIGHT = 30, 225  # median grey levels
 FEW_CORNERS = 60
-STILL_SHARE = 0.01  # of the picture
+STILL_SHARE = 0.003  # of the picture
 _FIELDS = (8.0, 150.0)  # degrees; lenses outside are rare, and slips common
 _OFF_CENTRE = 0.2  # of the picture's side
 _ASPECT = 1.15  # between fx and fy
@@ -76,9 +76,10 @@ def picture_problems(facts: dict[str, Any]) -> list[Problem]:
     if facts["still"] > STILL_SHARE:
         found.append(
             Problem(
-                f"{100 * facts['still']:.0f} % of the picture never changes while the rest does (an overlay, a border, "
+                f"{100 * facts['still']:.1f} % of the picture never changes while the rest does (an overlay, a border, "
                 "or a part of what carries the camera)",
-                "points there stand still and pull the poses with them; cut that part off, or mask it",
+                "points there stand still and pull the poses with them; `improvo info SEQUENCE --write-mask mask.png` "
+                "writes a mask of it, and every command leaves it out with --mask mask.png",
             )
         )
     if facts["corners"] < FEW_CORNERS:

@@ -10,6 +10,7 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.sequences.sequence import Sequence
+from improvo.sequences.still import StillPixels
 from improvo.types import Float64, UInt8
 
 DUPLICATE_LEVELS = 0.6  # mean grey levels between neighbours at 160 pixels width: less is the same picture again
@@ -17,11 +18,6 @@ BLUR_SHARE = 0.5  # of the recording's own sharpness
 CLIPPED = (5, 250)  # grey levels
 _WORK_WIDTH = 320
 _DUPLICATE_WIDTH = 160
-_STILL_WIDTH = 96
-_STILL_LEVELS = 2.0  # deviation of a pixel over the recording that counts as none
-_MOVING_LEVELS = 8.0  # median deviation of a picture whose camera moves
-_STILL_FRAMES = 12  # fewer say nothing
-_STRUCTURE = 6.0  # grey levels of gradient: where there is none, a picture that moves looks the same too
 
 
 def measure(sequence: Sequence, samples: int, progress: Callable[[int], object]) -> dict[str, Any]:
@@ -36,7 +32,7 @@ def measure(sequence: Sequence, samples: int, progress: Callable[[int], object])
     rows: list[Float64] = []
     duplicates, pairs, with_depth, depth_median = 0, 0, 0, []
     previous: tuple[int, UInt8] | None = None
-    still = _Still()
+    still = StillPixels()
     for start in starts.tolist():
         pair = []
         for row in (start, start + 1)[: len(sequence)]:
@@ -70,7 +66,7 @@ def measure(sequence: Sequence, samples: int, progress: Callable[[int], object])
         "brightness": round(float(np.median(looks[:, 1])), 1),
         "clipped": round(float(looks[:, 2].mean()), 3),
         "corners": int(np.median(looks[:, 3])),
-        "still": round(still.share(), 3),
+        "still": round(still.share(sequence.mask(0)), 4),
         "depth": depth_facts,
     }
 
@@ -101,33 +97,3 @@ def _difference(a: UInt8, b: UInt8) -> float:
     height = max(1, round(a.shape[0] * _DUPLICATE_WIDTH / a.shape[1]))
     small = [cv2.resize(image, (_DUPLICATE_WIDTH, height), interpolation=cv2.INTER_AREA) for image in (a, b)]
     return float(cv2.absdiff(small[0], small[1]).mean())
-
-
-class _Still:
-    """How much of the picture stays the same while the rest changes: overlays, borders, parts of a vehicle."""
-
-    def __init__(self) -> None:
-        self._count = 0
-        self._sum = self._squares = np.zeros((0, 0))
-
-    def add(self, image: UInt8) -> None:
-        """One more sampled picture."""
-        height = max(1, round(image.shape[0] * _STILL_WIDTH / image.shape[1]))
-        small = cv2.resize(image, (_STILL_WIDTH, height), interpolation=cv2.INTER_AREA).astype(np.float64)
-        if self._count == 0:
-            self._sum = self._squares = np.zeros_like(small)
-        self._sum, self._squares = self._sum + small, self._squares + small**2
-        self._count += 1
-
-    def share(self) -> float:
-        """The share of the picture; 0 where too few pictures were seen, or where nothing moves anyway."""
-        if self._count < _STILL_FRAMES:
-            return 0.0
-        mean = self._sum / self._count
-        deviation = np.sqrt(np.maximum(self._squares / self._count - mean**2, 0.0))
-        if np.median(deviation) < _MOVING_LEVELS:
-            return 0.0
-        across, down = np.gradient(mean)
-        structured = cv2.dilate((np.hypot(across, down) > _STRUCTURE).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        still = (deviation < _STILL_LEVELS) & structured
-        return float(cv2.erode(still.astype(np.uint8), np.ones((2, 2), np.uint8)).mean())

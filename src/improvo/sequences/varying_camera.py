@@ -6,7 +6,6 @@ phone by a per mille or so, so the median is used; a recording in which it moves
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from improvo.geometry.camera_files import Calibration
 from improvo.geometry.text_files import decoded
 from improvo.geometry.trajectory_files import clean_poses
 from improvo.types import Float64, Trajectory
+from improvo.untrusted.text import load_json, reason
 
 MAX_VARIATION = 0.01
 _CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL cameras look along -z with y up
@@ -74,10 +74,9 @@ def read_json(path: Path, data: bytes | None = None) -> dict[str, Any]:
         InputError: not JSON, or no mapping.
     """
     try:
-        content = json.loads(decoded(path.read_bytes() if data is None else data))
-    except (OSError, ValueError, RecursionError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise InputError(f"{path}: cannot be read as JSON ({reason}); export it again") from None
+        content = load_json(decoded(path.read_bytes() if data is None else data))
+    except (OSError, ValueError, MemoryError) as error:
+        raise InputError(f"{path}: cannot be read as JSON ({reason(error)}); export it again") from None
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds no JSON object; export it again")
     return content
@@ -87,6 +86,6 @@ def numbers(values: Any, count: int) -> Float64:
     """(count,) float64, NaN where `values` is anything else."""
     try:
         result = np.array(values, np.float64).ravel()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError, RecursionError):
         return np.full(count, np.nan)
     return result if len(result) == count else np.full(count, np.nan)

@@ -1,10 +1,12 @@
-"""Which codec a video file has that cannot be decoded, from its container; and what to do about it."""
+"""What a video file is, from its first bytes: no video at all, or a codec that cannot be decoded; and the mend."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
+_HEAD = 4096  # bytes; every container has a NUL in them, no text has
+_SCRIPTS = (b"ffconcat", b"#ext", b"v=0", b"<?xml", b"<asx", b"[playlist]", b"[reference]", b";ffmeta", b"#!")
 _SEARCHED = 1 << 24  # bytes at the beginning and at the end of a file
 _NAMES = {
     b"av01": "AV1",
@@ -54,6 +56,17 @@ def video_codec(path: Path) -> str | None:
         return _NAMES[match.group(1)]
     found = _MATROSKA.search(data) if data.startswith(b"\x1aE\xdf\xa3") else None
     return None if found is None else _NAMES.get(found.group(0), found.group(0).decode()[2:])
+
+
+def is_script(path: Path) -> bool:
+    """Whether a file is a playlist or another text, which FFmpeg would follow to other files and addresses."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+    except OSError:
+        return False
+    start = head.lstrip(b"\xef\xbb\xbf\xfe\xff\0 \t\r\n").lower()
+    return b"\0" not in head or start.startswith(_SCRIPTS) or b"<mpd" in start
 
 
 def _ends(path: Path) -> bytes:

@@ -18,7 +18,7 @@ from improvo.errors import InputError
 from improvo.geometry.camera_files import folder_calibration
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
 from improvo.sequences.rates import DEFAULT_FPS
-from improvo.sequences.video_codec import why_unreadable
+from improvo.sequences.video_codec import is_script, why_unreadable
 from improvo.types import Int64, UInt8
 
 VIDEO_SUFFIXES = frozenset(
@@ -59,6 +59,8 @@ class VideoFile(Recording):
             raise InputError(f"{path}: is no video file")
         if path.stat().st_size == 0:
             raise InputError(f"{path}: the file is empty; copy the video again")
+        if is_script(path):
+            raise InputError(f"{path}: is a text that names other files, not a video; give the videos themselves")
         self._position = -1  # frame that the decoder stands on
         self._image: UInt8 | None = None  # of `_position`, when it was asked for
         self._end: int | None = None  # where decoding turned out to end, before the last packet

@@ -15,6 +15,7 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.evaluation.settings import SurvivalSettings
 from improvo.frontend import Frontend
+from improvo.frontend.masking import features_of
 from improvo.geometry.camera import Camera
 from improvo.sequences import Sequence as FrameSequence
 from improvo.tracking.matching import mutual_nearest_neighbours
@@ -77,10 +78,10 @@ def surviving_matches(
     features: dict[int, Features] = {}
     for row in sorted({int(row) for pairs in wanted.values() for row in pairs.ravel()}):
         try:
-            image = sequence[row].image
+            frame = sequence[row]
         except InputError:
             continue
-        found = frontend(image)
+        found = features_of(frontend, frame)
         features[row] = found.take(np.arange(min(len(found), settings.max_keypoints)))
     results = []
     for gap, pairs in wanted.items():

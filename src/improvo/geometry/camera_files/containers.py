@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import configparser
-import json
 import re
 from pathlib import Path
 from typing import Any
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files.calibration import MEND
+from improvo.untrusted.arrays import read_npz
+from improvo.untrusted.text import load_json, load_yaml
+
+_MAX_DEPTH = 64  # of elements
 
 
 def parse_yaml(content: str, path: Path) -> dict[str, Any]:
@@ -37,8 +40,8 @@ def parse_tree(content: str, path: Path) -> Any:
         return _ini(content, path)
     if start in ("{", "["):
         try:
-            return json.loads(content)
-        except (ValueError, RecursionError) as error:
+            return load_json(content)
+        except ValueError as error:
             if path.suffix.lower() == ".json":
                 raise InputError(f"{path}: is not valid JSON ({error}); {MEND}") from None
     lines = [line.strip() for line in content.splitlines() if line.strip() and line.strip()[0] not in "#;"]
@@ -56,28 +59,23 @@ def parse_npz(path: Path) -> dict[str, Any]:
     Raises:
         InputError: not such a file, or it holds more than arrays.
     """
-    import numpy as np
-
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name].tolist() for name in archive.files if archive[name].size <= 32}
-    except Exception as error:  # a damaged archive may fail anywhere in zip, zlib and numpy
+        # the corners of a calibration's pictures lie beside the camera, so large arrays are no fault
+        return {name: values.tolist() for name, values in read_npz(path).items() if values.size <= 32}
+    except ValueError as error:
         raise InputError(f"{path}: cannot be read as NPZ ({str(error)[:80]}); {MEND}") from None
 
 
 def _yaml(content: str, path: Path) -> Any:
-    import yaml
-
     # OpenCV's FileStorage starts with "%YAML:1.0" and tags matrices, neither of which is YAML 1.1; it also takes
     # tabs, and a key without a space after its colon
     content = re.sub(r"^%YAML.*$", "", content, flags=re.MULTILINE)
     content = re.sub(r"!!(?:opencv-[\w-]+|python/tuple|float|map)", "", content).replace("\t", "  ")
     content = re.sub(r"^(\s*[A-Za-z_][\w.]*):(?=[-+.\d\[])", r"\1: ", content, flags=re.MULTILINE)
     try:
-        documents = list(yaml.safe_load_all(content))
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise InputError(f"{path}: is not valid YAML ({' '.join(str(error).split())[:120]}); {MEND}") from None
-    return next((document for document in documents if document is not None), None)
+        return load_yaml(content)
+    except ValueError as error:
+        raise InputError(f"{path}: is not valid YAML ({error}); {MEND}") from None
 
 
 def _ini(content: str, path: Path) -> dict[str, Any]:
@@ -117,8 +115,10 @@ def _xml(content: str, path: Path) -> Any:
     from xml.etree import ElementTree
 
     try:
+        if "<!ENTITY" in content or "<!DOCTYPE" in content:
+            raise ValueError("it defines entities")
         root = ElementTree.fromstring(content)
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, ValueError) as error:
         raise InputError(f"{path}: is not valid XML ({error}); {MEND}") from None
     metashape = root if root.tag == "calibration" else root.find(".//calibration")
     if metashape is not None:
@@ -126,14 +126,16 @@ def _xml(content: str, path: Path) -> Any:
             return _metashape({child.tag: (child.text or "").strip() for child in metashape})
         except (KeyError, ValueError) as error:
             raise InputError(f"{path}: as a Metashape calibration: {error}; {MEND}") from None
-    return _element(root)
+    return _element(root, path)
 
 
-def _element(element: Any) -> Any:
+def _element(element: Any, path: Path, depth: int = 0) -> Any:
+    if depth > _MAX_DEPTH:
+        raise InputError(f"{path}: is nested too deeply for a calibration; {MEND}")
     children = list(element)
     if not children:
         return (element.text or "").strip()
-    return {child.tag: _element(child) for child in children}
+    return {child.tag: _element(child, path, depth + 1) for child in children}
 
 
 def _metashape(values: dict[str, str]) -> dict[str, Any]:
