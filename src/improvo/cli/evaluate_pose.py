@@ -204,10 +204,9 @@ def _draw(results: dict[str, Any], output: Path) -> None:
 
 def _export(arguments: argparse.Namespace) -> int:
     """Write the frames that the evaluation will use, as delivered, for a frontend that runs elsewhere."""
-    import cv2
 
     from improvo.evaluation.pose.pairs import pairs_of_sequence
-    from improvo.files import make_output_folder, written_atomically
+    from improvo.files import make_output_folder, write_picture
 
     make_output_folder(arguments.export_images, f"{COMMAND} --export-images")
     settings, sources = _settings(arguments)
@@ -222,8 +221,7 @@ def _export(arguments: argparse.Namespace) -> int:
                 frame = sequence[row]
             except ImprovoError:
                 continue  # its pairs are left out of the evaluation, too
-            with written_atomically(folder / f"{frame.source_index:06d}.png") as temporary:
-                cv2.imwrite(str(temporary), frame.image)
+            write_picture(folder / f"{frame.source_index:06d}.png", frame.image)
             written += 1
     say(f"{written} images in {arguments.export_images}; export features as SEQUENCE/NUMBER.npz beside or elsewhere")
     return 0

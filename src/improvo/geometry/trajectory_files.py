@@ -283,6 +283,8 @@ def read_times(path: Path) -> tuple[Float64, tuple[str, ...]]:
     lines = read_text(path, "times", mend).splitlines()
     lines = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     rows = [split_numbers(line) for line in lines]
+    if not all(rows):
+        raise InputError(f"{path}: has a line of separators alone; {mend}")
     if all(re.fullmatch(r"\d+,\d+", line) for line in lines) and not _counts(rows):
         whole = [float(row[0]) for row in rows]
         if any(b <= a for a, b in pairwise(whole)):  # decimal commas: alone, the part before them does not increase
@@ -295,7 +297,7 @@ def read_times(path: Path) -> tuple[Float64, tuple[str, ...]]:
         else:
             column = 1 if _counts(rows) else 0
             stamps = np.array([float(row[column]) for row in rows], np.float64)
-    except ValueError as error:
+    except (ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{path}: must hold one time in seconds per line ({error}); repair or remove it") from None
     if not np.isfinite(stamps).all():
         raise InputError(f"{path}: holds a time that is not finite; repair or remove it")
