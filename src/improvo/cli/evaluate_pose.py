@@ -17,7 +17,8 @@ from improvo.cli.evaluate_options import add_frontend_arguments, add_run_argumen
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
 from improvo.cli.output import figures, next_step, say
 from improvo.errors import ImprovoError, InputError
-from improvo.evaluation.settings import ESTIMATORS, SAMPLINGS, PoseCommandSettings, PoseSettings
+from improvo.evaluation.settings import ESTIMATORS, PoseCommandSettings, PoseSettings
+from improvo.geometry.depth_sampling import SAMPLINGS
 from improvo.untrusted.text import read_json_file
 
 if TYPE_CHECKING:

@@ -16,6 +16,7 @@ from improvo.errors import InputError
 from improvo.geometry.camera import Camera
 from improvo.geometry.trajectory_files import read_trajectory
 from improvo.odometry.map_file import read_map
+from improvo.odometry.run import unit_of
 from improvo.sequences import Sequence, SequenceSettings, open_sequence
 from improvo.stability.rule import IGNORE
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
@@ -75,6 +76,11 @@ class RunFolder:
     def name(self) -> str:
         """The recording's name."""
         return self._recorded_input.name or str(self._recorded_input)
+
+    @property
+    def unit(self) -> str:
+        """Of lengths, in words: metres and from what they are known, or up to scale."""
+        return unit_of(self.report)
 
     @property
     def frames(self) -> int:
