@@ -54,7 +54,14 @@ class FakeTraining:
         output, seed = job.output, job.seed
         seen = [one.labeled.frames.source_index[one.fixed_run().has_depth].tolist() for one in job.reference]
         self.calls.append(
-            {"labels": [job.labels], "seed": seed, "start": job.start, "seen": seen, "control": job.control}
+            {
+                "labels": [job.labels],
+                "seed": seed,
+                "start": job.start,
+                "seen": seen,
+                "control": job.control,
+                "steps": job.steps,
+            }
         )
         make_output_folder(output, "train held")
         for part in range(20):  # as steps: something to interrupt

@@ -124,8 +124,10 @@ class Rounds:
             OutputError: it cannot be written (full disk).
         """
         store, settings = self._folder.reference, self._settings.reference
-        paths = list(dict.fromkeys((*split.training.paths, *split.held_back.paths)))
-        self._label(self._folder.start, paths, self._settings.sequence, store, "reference")
+        paths = list(dict.fromkeys(path.resolve() for path in (*split.training.paths, *split.held_back.paths)))
+        done = {record.path for record in read_records(store) if record.state == DONE} if store.is_dir() else set()
+        if not all(str(path) in done for path in paths):
+            self._label(self._folder.start, paths, self._settings.sequence, store, "reference")
         found = []
         for kind, part, most in (
             (TRAINING, split.training, settings.most_training),
@@ -215,7 +217,7 @@ class Rounds:
             return
         records = read_records(reference)
         done = {record.path for record in records if record.state == DONE}
-        if all(str(path) in done for path in part.paths):
+        if all(str(path.resolve()) in done for path in part.paths):
             share_labels(reference, records, part, store)
 
     @property
