@@ -212,8 +212,10 @@ def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(wa
     assert [found.name for found in read_labels(result.candidates[0].held_back)] == ["hall"]
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Left out: black: " in page
-    # in the survey, which is the reference too, and by links in the labels of the training part
-    assert sum("room: " in line and "with a pose" in line for line in lines) == 3
+    # once in the survey, which is the reference too, and once by a link in the labels of the training part
+    assert sum("room: " in line and "with a pose" in line for line in lines) == 2
+    assert (tmp_path / "out" / "reference" / "hall" / "depth-held-back.zip").is_file()
+    assert not (tmp_path / "out" / "reference" / "hall" / "depth-training.zip").exists()
     with pytest.raises(InputError, match="nothing could be labelled"):
         run(tmp_path / "nothing", [black, short], FakeTraining())
     few = replace(SETTINGS, sequence=replace(SETTINGS.sequence, end=5))
@@ -266,9 +268,9 @@ def test_a_run_that_ends_after_each_of_its_steps_goes_on(
         step = getattr(Rounds, name)
 
         def stopping(rounds: Rounds, *arguments: object) -> object:
-            there = name != "label" and arguments[0].validation.is_file()  # type: ignore[attr-defined]
+            there = name in ("train", "validate") and arguments[0].validation.is_file()  # type: ignore[attr-defined]
             done = step(rounds, *arguments)
-            key = f"{name} {len(training.calls)} {arguments[0]}"
+            key = name if name == "reference" else f"{name} {len(training.calls)} {arguments[0]}"
             if key not in made and not there:
                 made.append(key)
                 raise StoppedError
@@ -276,7 +278,7 @@ def test_a_run_that_ends_after_each_of_its_steps_goes_on(
 
         monkeypatch.setattr(Rounds, name, stopping)
 
-    for name in ("label", "train", "validate"):
+    for name in ("reference", "label", "train", "validate"):
         stop_after(name)
     training = FakeTraining()
     stops = 0
@@ -286,7 +288,7 @@ def test_a_run_that_ends_after_each_of_its_steps_goes_on(
             break
         except StoppedError:
             stops += 1
-    assert stops == len(made) >= 7  # three validations, two rounds of labelling and learning
+    assert stops == len(made) >= 8  # the reference, three validations, two rounds of labelling and learning
     assert len(training.calls) == 2
     assert results(tmp_path / "out") == results(finished[0].weights.parent)
 

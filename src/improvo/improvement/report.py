@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from improvo.errors import InputError
@@ -48,7 +49,7 @@ def write_report(
         for number, (candidate, validation) in enumerate(zip(candidates, validations, strict=True))
     ]
     if control:
-        rounds.append(_round(*control, split, settings, pictures=False))
+        rounds.append(replace(_round(*control, split, settings, pictures=False), aside=True))
     names = ", ".join(one.name for one in split.training.paths[:3])
     if len(split.training.paths) > 3:
         names += f" and {len(split.training.paths) - 3} more"
@@ -61,6 +62,7 @@ def write_report(
         _notes(candidates, validations, split, settings),
         best,
         _verdict(candidates, validations, best, settings, control),
+        _gains([*zip(candidates, validations, strict=True), *([control] if control else [])], settings.validation),
     )
 
 
@@ -156,6 +158,18 @@ def _round(
     )
 
 
+def _gains(judged: Sequence[tuple[Candidate, Validation]], settings: ValidationSettings) -> list[list[str]]:
+    """Header, then for each frontend after the first its gain in right matches over the first, with intervals."""
+    (_, start), *others = judged
+    rows = [["right matches", "all gaps", *(start.gap_words(level) for level in start.levels)]]
+    for candidate, validation in others:
+        names, limits = (loose(settings.matches), strict(settings.matches)), settings.matches.right_px[::-1]
+        for name, limit in zip(names, limits, strict=True):
+            gains = (gain(validation, start, name, settings.matches, level) for level in (None, *start.levels))
+            rows.append([f"{candidate.name}, {limit:g} px", *(found.words for found in gains)])
+    return rows
+
+
 def _verdict(
     candidates: Sequence[Candidate],
     validations: Sequence[Validation],
@@ -167,22 +181,14 @@ def _verdict(
     words = rule(how)
     if best:
         words += f" Kept: {candidates[best].name}; right matches against the start: "
-        words += f"{gain_words(validations[best], start, how)} ({_by_gap(validations[best], start, how)})."
+        words += f"{gain_words(validations[best], start, how)}."
     elif len(candidates) > 1:
         words += " No round was better than the start: the weights kept are those at the start, unchanged."
-        tried = gain_words(validations[-1], start, how)
-        words += f" {candidates[-1].name}: {tried} ({_by_gap(validations[-1], start, how)})."
+        words += f" {candidates[-1].name}: {gain_words(validations[-1], start, how)}."
     if control:
         words += " The control, trained for as many steps on the same frames by homographies alone: "
-        words += f"{gain_words(control[1], start, how)} ({_by_gap(control[1], start, how)})."
+        words += f"{gain_words(control[1], start, how)}."
     return words
-
-
-def _by_gap(validation: Validation, start: Validation, settings: ValidationSettings) -> str:
-    """The gain at every gap, with its interval."""
-    judge = settings.matches
-    gains = [gain(validation, start, loose(judge), judge, level) for level in start.levels]
-    return "; ".join(f"{start.gap_words(level)}: {g.words}" for level, g in zip(start.levels, gains, strict=True))
 
 
 def _notes(
