@@ -59,8 +59,8 @@ class ValidationSettings:
 
     matches: SelfTruthSettings = field(default_factory=lambda: SelfTruthSettings(pairs=100))
     gaps: tuple[int, ...] = ()  # frames between the two images of a pair; by default as far as `overlaps` says
-    # share of a frame that the other one still shows, one for each gap; at 30 Hz by hand about 1, 2 and 3 seconds
-    overlaps: tuple[float, ...] = (0.75, 0.6, 0.5)
+    # share of a frame that the other one still shows, one for each gap; held in the hand about 1, 2 and 3 seconds
+    overlaps: tuple[float, ...] = (0.65, 0.5, 0.4)
     min_pairs: int = 10  # of a gap; what is held back is too short for wider ones
     frames_lost: float = 0.01  # share of the frames tracked by the best frontend so far that a better one may lose
     segments_more: int = 0  # than with the best frontend so far, by which the odometry of a better one may break
