@@ -15,10 +15,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from improvo.cli.train_homographies import read_data_card
+from improvo.cli.train_options import read_data_card
 from improvo.frontend.quantisation import calibrate
-from improvo.frontend.weights import BUNDLED, Weights, load_weights, save_weights
+from improvo.frontend.weights import BUNDLED, DataSource, Weights, find_weights, load_weights, save_weights
 
+FIGURES = ("pairs", "rotation_success", "translation_success", "precision", "precision_8px")
 NO_HEAD = "The stability head is not part of these weights: only VO adaptation can teach it. "
 ATTRIBUTION = (
     "All frames were converted to greyscale, reduced and re-compressed. The authors of the data sets do not endorse "
@@ -32,9 +33,18 @@ def pose_figures(path: Path, label: str) -> dict[str, Any]:
     figures: dict[str, Any] = {}
     for row in json.loads(path.read_text())["rows"]:
         if row["frontend"] == label:
-            entry = {key: row[key] for key in ("pairs", "rotation_success", "translation_success")}
+            entry = {key: row[key] for key in FIGURES if key in row}
             figures.setdefault(row["estimator"], {})[str(row["gap"])] = entry
     return figures
+
+
+def with_ancestors(data: tuple[DataSource, ...], ancestors: list[str]) -> tuple[DataSource, ...]:
+    """The sources, and those of the weights (bundled names or files) that these came from, each once."""
+    sources = {source.name: source for source in data}
+    for ancestor in ancestors:
+        for source in load_weights(find_weights(ancestor)).card.data:
+            sources.setdefault(source.name, source)
+    return tuple(sources.values())
 
 
 def with_stability_odds(weights: Weights, ratio: float) -> Weights:
@@ -48,12 +58,16 @@ def main() -> None:
     """Write the bundled file and its card."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("weights", type=Path)
-    parser.add_argument("name", help="of the bundled weights, and the label of its rows")
+    parser.add_argument("name", help="of the bundled weights")
     parser.add_argument("pose", nargs="*", metavar="SEQUENCE=POSE.json")
     parser.add_argument(
         "--data-card", type=Path, help="what the weights were trained on, where their card does not say it all"
     )
     parser.add_argument("--start", help="the bundled weights that they began as")
+    parser.add_argument(
+        "--ancestor", action="append", default=[], metavar="WEIGHTS", help="weights whose data these come from too"
+    )
+    parser.add_argument("--label", help="of its rows in the POSE.json files, if not the name")
     parser.add_argument("--commit", help="of the code that trained them, where it was not yet committed")
     parser.add_argument(
         "--stability-odds",
@@ -68,7 +82,7 @@ def main() -> None:
     poses = {}
     for entry in arguments.pose:
         sequence, _, path = entry.partition("=")
-        poses[sequence] = pose_figures(Path(path), arguments.name)
+        poses[sequence] = pose_figures(Path(path), arguments.label or arguments.name)
     training = {key: value for key, value in weights.card.metrics.items() if key != "pose"}
     card = replace(
         weights.card,
@@ -77,6 +91,7 @@ def main() -> None:
     )
     if arguments.data_card:
         card = replace(card, data=read_data_card(arguments.data_card))
+    card = replace(card, data=with_ancestors(card.data, arguments.ancestor))
     if arguments.start:
         card = replace(card, training={**card.training, "start": arguments.start})
     if arguments.commit:
@@ -87,7 +102,8 @@ def main() -> None:
         weights = with_stability_odds(weights, arguments.stability_odds)
     weights = replace(weights, card=card)
     if arguments.calibrate:
-        files = sorted(arguments.calibrate.glob("*.jpg"))[::6]
+        files = sorted(arguments.calibrate.glob("*.jpg"))
+        files = files[:: max(1, len(files) // 40)]
         weights = calibrate(weights, (cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files))
     BUNDLED.mkdir(exist_ok=True)
     save_weights(BUNDLED / f"{arguments.name}.safetensors", weights.tensors, weights.card)

@@ -7,7 +7,6 @@ teachers and the making of the batch), of making batches alone, and of inference
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 import time
@@ -18,15 +17,16 @@ import torch
 from torch.nn import functional
 
 from improvo.frontend.channel_pruning import without_dead_channels
+from improvo.frontend.runtime_torch import load_network
 from improvo.frontend.superpoint import heat_map
 from improvo.frontend.weights import find_weights, load_weights
 from improvo.training.device_pairs import DevicePairs
 from improvo.training.held import HeldStage
 from improvo.training.held_training import network_teacher
+from improvo.training.metrics import METRICS, read_metrics
 from improvo.training.pack import read_pack
 from improvo.training.pictures import Pictures
 from improvo.training.settings import HeldSettings
-from improvo.training.stages import loaded
 from improvo.training.trainer import Trainer, choose_device
 
 # largest difference of a heat map, and of 1 - cosine of a descriptor (99th percentile), from the CPU in float32
@@ -35,7 +35,7 @@ TOLERANCE = {torch.float32: (2e-3, 1e-4), torch.bfloat16: (0.15, 5e-3)}
 
 def agreement(views: torch.Tensor, device: torch.device) -> bool:
     """Compare `superpoint-vo` on views (V, 1, H, W) in [0, 1] between this device and the CPU."""
-    network = loaded(load_weights(find_weights("superpoint-vo")))
+    network = load_network(load_weights(find_weights("superpoint-vo")))
     with torch.inference_mode():
         wanted = network(views.cpu())
         network = network.to(device, memory_format=torch.channels_last)
@@ -61,11 +61,11 @@ def training_rate(name: str, batches: DevicePairs, settings: HeldSettings, steps
     batches.settings = settings
     batches.detector = network_teacher(weights, "detector", batches.device, torch.bfloat16)
     optimiser = replace(settings.optimiser, steps=steps, log_every=steps // 2, checkpoint_minutes=10.0)
-    network = loaded(without_dead_channels(weights))
+    network = load_network(without_dead_channels(weights))
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(HeldStage(network, settings), batches, optimiser, Path(folder))
         trainer.run(progress=False)
-        row = json.loads((Path(folder) / "metrics.jsonl").read_text().splitlines()[-1])
+        row = read_metrics(Path(folder) / METRICS)[-1]
     return 2 * settings.optimiser.batch_size / row["step_seconds"], row["loss"]
 
 
@@ -135,7 +135,7 @@ def main() -> int:
     for name in names:
         for chosen in with_size:
             tell(name, chosen)
-    network = loaded(load_weights(find_weights("superpoint-vo"))).to(device, memory_format=torch.channels_last)
+    network = load_network(load_weights(find_weights("superpoint-vo"))).to(device, memory_format=torch.channels_last)
     images = torch.rand(16, 1, 480, 640, device=device)
     with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16):
         rate = 16 / timed(lambda _: network(images), device, 1 if arguments.tiny else 20)

@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from improvo.cli.train_homographies import read_data_card
+from improvo.cli.train_options import read_data_card
 from improvo.simulation.causes import Cause
 from improvo.training.pack import write_pack
 from improvo.training.pictures import Pictures, Source, load_pictures

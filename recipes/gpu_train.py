@@ -13,14 +13,16 @@ import subprocess
 import sys
 import time
 import traceback
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from improvo import files
-from improvo.config import from_dict, to_dict
+from improvo.config import from_dict, over
 from improvo.frontend.weights import find_weights
+from improvo.training.metrics import METRICS, read_metrics
 from improvo.training.settings import HeldSettings
 
 HERE = Path(__file__).parent
@@ -30,20 +32,11 @@ ERROR = "error.txt"
 END_SECONDS = 6.0  # kept for saving the last weights
 
 
-def merged(*parts: dict[str, Any]) -> dict[str, Any]:
-    """Nested settings, later ones over earlier ones."""
-    result: dict[str, Any] = {}
-    for part in parts:
-        for key, value in part.items():
-            result[key] = merged(result.get(key, {}), value) if isinstance(value, dict) else value
-    return result
-
-
 def settings_of(job: dict[str, Any], plan: dict[str, Any], arguments: argparse.Namespace) -> HeldSettings:
     """The settings of one job."""
-    given = merged(plan["common"], plan["tiny"] if arguments.tiny else {}, job.get("settings", {}))
-    given = merged(given, {"compile": arguments.compile})
-    return from_dict(HeldSettings, merged(to_dict(HeldSettings()), given), where=job["name"])
+    parts = (plan["common"], plan["tiny"] if arguments.tiny else {}, job.get("settings", {}))
+    given = reduce(over, (*parts, {"compile": arguments.compile}))
+    return from_dict(HeldSettings, given, where=job["name"])
 
 
 def run_job(job: dict[str, Any], plan: dict[str, Any], arguments: argparse.Namespace) -> None:
@@ -82,12 +75,12 @@ def collect(jobs: list[dict[str, Any]], arguments: argparse.Namespace) -> list[s
     told, metrics = [], {}
     for job in jobs:
         folder = arguments.work / job["name"]
-        weights, table = folder / WEIGHTS, folder / "metrics.jsonl"
+        weights, table = folder / WEIGHTS, folder / METRICS
         copy = arguments.output / f"{job['name']}.safetensors"
         if weights.is_file() and (not copy.exists() or copy.stat().st_mtime < weights.stat().st_mtime):
             with files.written_atomically(copy) as temporary:
                 temporary.write_bytes(weights.read_bytes())
-        rows = [json.loads(line) for line in table.read_text().splitlines()] if table.is_file() else []
+        rows = read_metrics(table)
         metrics[job["name"]] = rows
         if rows:
             names = ("step", "loss", "descriptor", "detector", "stability", "right", "step_seconds")

@@ -20,9 +20,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from improvo.cli.train_homographies import read_data_card
+from improvo.cli.train_options import read_data_card
 from improvo.errors import ImprovoError
-from improvo.training.distributed import Share
+from improvo.training.distributed import Process
 from improvo.training.settings import HomographiesSettings
 from improvo.training.stages import train_homographies
 
@@ -73,7 +73,7 @@ def main() -> int:
         detector=small_weights if arguments.round else None,
         data=data,
     )
-    if Share.of_this_process().leads:
+    if Process.current().leads:
         print(f"superpoint-small: {small_weights}\nsuperpoint: {full_folder / 'weights.safetensors'}")
     return 0
 

@@ -92,7 +92,7 @@ def write_labeled_scene(
     )
     write_trajectory(partial / "trajectory.txt", Trajectory(times, poses))
     (partial / "run.json").write_text(json.dumps({"camera": to_dict(CAMERA)}))
-    pack_images(partial, [draw(frame) for frame in range(FRAMES)])
+    pack_images(partial, [(draw(frame), None) for frame in range(FRAMES)])
     counts = {"stable": int((stability == STABLE).sum()), "unstable": int((stability == UNSTABLE).sum())}
     store.finish(
         SequenceRecord(name, "/nowhere", DONE, frames=FRAMES, tracked=FRAMES, tracks=len(tracks), packed=True, **counts)

@@ -20,7 +20,7 @@ from improvo import config, terminal
 from improvo.cli.commands import COMMANDS, leaves, settings_class
 from improvo.cli.flags import comments
 from improvo.cli.main import main
-from improvo.odometry.run_settings import RunSettings
+from improvo.depth.run_settings import DenseRunSettings
 from improvo.simulation import bundled_sequence
 
 ALL = [words for words, _ in leaves()]
@@ -187,6 +187,6 @@ def test_settings_of_a_network_reach_the_run(tmp_path: Path, capsys: pytest.Capt
     configuration = json.loads((tmp_path / "out" / "run.json").read_text())["configuration"]
     assert configuration["frontend"]["network"]["precision"] == "float32"
     assert configuration["frontend"]["network"]["threshold"] == 0.02
-    assert config.from_dict(RunSettings, configuration).frontend.network.threads == 1
+    assert config.from_dict(DenseRunSettings, configuration).frontend.network.threads == 1
     assert main([*words, "--frontend", "orb", "--precision", "float32"]) == 2
     assert "not a network" in capsys.readouterr().err

@@ -69,8 +69,10 @@ def test_every_former_name_leads_to_a_setting() -> None:
     from improvo.improvement.settings import ImproveSettings
     from improvo.odometry.settings import OdometrySettings
     from improvo.stability.settings import LabelSettings
+    from improvo.training.settings import PairSettings
 
     every = {"odometry": OdometrySettings(), "labels": LabelSettings(), "improve": ImproveSettings()}
+    every |= {"pairs": PairSettings()}
     now = {name: config.to_dict(settings) for name, settings in every.items()}
     now |= {name: value for name, value in now["odometry"].items() if isinstance(value, dict)}
     for section, names in config.FORMER_NAMES.items():

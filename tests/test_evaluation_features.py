@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -175,3 +176,11 @@ def test_deformable_convolution_without_torchvision() -> None:
         )
         expected += weight[:, :, tap // 3, tap % 3] @ mixed
     torch.testing.assert_close(found[0, :, row, column], expected)
+
+
+def test_numbers_that_are_not_the_files_own_names(tmp_path: Path) -> None:
+    """`--export-images` writes SEQUENCE/000042.png, whatever the recording calls its files."""
+    frame = replace(PlaneSequence(name="rec")[3], source="/data/rec/frame-000107.color.jpg")
+    names = candidate_names("rec", frame, one_sequence=False)
+    assert "rec/000003.png" in names
+    assert names.index("rec/frame-000107.color.jpg") < names.index("rec/000003.png")

@@ -297,3 +297,22 @@ def settings_with(settings: TrajectorySettings, alignment: str) -> TrajectorySet
     from dataclasses import replace
 
     return replace(settings, alignment=alignment)
+
+
+def test_kitti_rows_without_times_count_the_rows_of_a_timed_file(tmp_path: Path) -> None:
+    from improvo.cli.evaluate_trajectory import read_pair
+    from improvo.geometry.trajectory_files import write_trajectory
+
+    truth = wander(5, 20)
+    write_trajectory(tmp_path / "truth.txt", truth)
+    write_trajectory(tmp_path / "kitti.txt", truth, "kitti")
+    for first, second in (("kitti.txt", "truth.txt"), ("truth.txt", "kitti.txt")):
+        estimate, other, notes = read_pair(tmp_path / first, tmp_path / second)
+        np.testing.assert_array_equal(estimate.times, other.times)
+        assert any("row by row" in note for note in notes)
+    rows = (tmp_path / "kitti.txt").read_text().splitlines()
+    (tmp_path / "kitti.txt").write_text("\n".join(rows[:-1]))
+    with pytest.raises(InputError, match=r"kitti.txt: has 100 poses without times, and the other 101; put a times.txt"):
+        read_pair(tmp_path / "kitti.txt", tmp_path / "truth.txt")
+    (tmp_path / "times.txt").write_text("".join(f"{time}\n" for time in truth.times))
+    assert len(read_pair(tmp_path / "kitti.txt", tmp_path / "truth.txt")[0]) == 100

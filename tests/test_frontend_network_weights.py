@@ -284,3 +284,23 @@ def test_calibration_is_kept_in_the_file(saved, tmp_path, capsys):
 def test_the_card_is_printed(saved, capsys):
     assert main(["weights", "show", str(saved)]) == 0
     assert json.loads(capsys.readouterr().out)["architecture"]["name"] == "tiny"
+
+
+@pytest.mark.parametrize("prefix", ["module.", "superpoint.", "extractor.", "model.net."])
+def test_import_finds_the_layout_behind_any_prefix(prefix: str) -> None:
+    from improvo.frontend.importing import LAYOUTS, convert
+
+    encoder = [(64, 1), (64, 64), (64, 64), (64, 64), (128, 64), (128, 128), (128, 128), (128, 128)]
+    sizes = [*encoder, (256, 128), (65, 256), (256, 128), (256, 256)]
+    tensors = {}
+    for position, (name, _) in enumerate(LAYOUTS[0].names.values()):
+        outs, ins = sizes[position]
+        kernel = 1 if position in (9, 11) else 3
+        tensors[f"{prefix}{name}.weight"] = np.full((outs, ins, kernel, kernel), 0.01, np.float32)
+        tensors[f"{prefix}{name}.bias"] = np.zeros(outs, np.float32)
+    tensors["optimiser.step"] = np.zeros(1)
+    weights, layout = convert(tensors, "lightning.ckpt", "mine")
+    assert layout is LAYOUTS[0]
+    assert weights.card.architecture.descriptor == 256
+    with pytest.raises(InputError, match="holds 2 networks"):
+        convert(tensors | {f"teacher.{name.removeprefix(prefix)}": v for name, v in tensors.items()}, "x", "mine")

@@ -8,7 +8,19 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "src" / "improvo"
 FLOORS = (
-    {"types", "config", "files", "continuation", "terminal", "errors", "compiled", "geometry", "jobs"},
+    {
+        "types",
+        "config",
+        "files",
+        "folder_lock",
+        "continuation",
+        "terminal",
+        "errors",
+        "compiled",
+        "untrusted",
+        "geometry",
+        "jobs",
+    },
     {"sequences", "calibration", "frontend", "tracking", "simulation"},
     {"stability", "backend"},
     {"odometry"},

@@ -11,7 +11,7 @@ import pytest
 
 from improvo.odometry.ahead import detected_ahead
 from improvo.odometry.visual_odometry import MatchedFeatures
-from improvo.types import Features, Frame, UInt8
+from improvo.types import Features, Frame
 
 
 def frames(count: int, read: list[int] | None = None, fails_at: int | None = None) -> Iterator[Frame]:
@@ -23,8 +23,10 @@ def frames(count: int, read: list[int] | None = None, fails_at: int | None = Non
         yield Frame(i, i / 30.0, np.full((2, 2), i, np.uint8), f"{i}.png")
 
 
-def detect(image: UInt8) -> Features:
-    return Features(np.full((1, 2), image[0, 0], np.float32), np.zeros((1, 4), np.float32), np.ones(1, np.float32))
+def detect(frame: Frame) -> Features:
+    return Features(
+        np.full((1, 2), frame.image[0, 0], np.float32), np.zeros((1, 4), np.float32), np.ones(1, np.float32)
+    )
 
 
 def match(features: Features) -> MatchedFeatures:

@@ -249,3 +249,47 @@ def test_jpeg_in_sens_and_in_bags(tmp_path: Path) -> None:
     for path in (tmp_path / "b.bag", encoders.write_sens(tmp_path / "s.sens", expected, "jpeg")):
         frames = list(open_sequence(path, camera="90,91,47,36.5"))
         assert all((frame.image == image).all() for frame, image in zip(frames, decoded, strict=True))
+
+
+def test_bag_as_the_realsense_sdk_records_it(tmp_path: Path) -> None:
+    made = scene()
+    colour, depth = "/device_0/sensor_1/Color_0", "/device_0/sensor_0/Depth_0"
+    with ros_encoders.BagWriter(tmp_path / "s.bag", 1) as bag:
+        for i, image in enumerate(made.images):
+            stamp = round(made.times[i] * 1000) * 1_000_000
+            if i == 0:
+                for topic in (colour, depth):
+                    info = bag.camera_info(stamp, made, "Inverse Brown Conrady")
+                    bag.write(f"{topic}/info/camera_info", info, stamp)
+            bag.write(f"{depth}/image/data", bag.image(stamp, made.millimetres(i), "mono16"), stamp)
+            bag.write(f"{colour}/image/data", bag.image(stamp, cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), "rgb8"), stamp)
+    sequence = open_sequence(tmp_path / "s.bag")
+    assert sequence.camera == CAMERA
+    assert all((frame.image == image).all() for frame, image in zip(sequence, made.images, strict=True))
+    found = sequence.depth(2)
+    assert found is not None
+    np.testing.assert_allclose(found, made.depths[2], atol=1e-6)
+
+
+def test_deep_pictures_in_bags_use_one_range(tmp_path: Path) -> None:
+    made = scene()
+    with ros_encoders.BagWriter(tmp_path / "s.bag", 1) as bag:
+        for i, image in enumerate(made.images):
+            stamp = round(made.times[i] * 1000) * 1_000_000
+            bag.write("/thermal/image_raw", bag.image(stamp, 7000 + 4 * image.astype(np.uint16), "mono16"), stamp)
+    sequence = open_sequence(tmp_path / "s.bag", fov=60.0)
+    assert any("stretched to 8 bits" in note for note in sequence.notes)
+    a, b = np.polyfit(made.images[1].ravel().astype(float), sequence[1].image.ravel().astype(float), 1)
+    assert a > 0.95
+    assert np.abs(a * made.images[1] + b - sequence[1].image).mean() < 2
+
+
+def test_nerf_synthetic_scenes_say_their_angle_only(tmp_path: Path) -> None:
+    folder = encoders.write_transforms(tmp_path / "s", scene())
+    content = json.loads((folder / "transforms.json").read_text())
+    frames = [{k: f[k] for k in ("file_path", "transform_matrix")} for f in content["frames"]]
+    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 0.98, "frames": frames}))
+    (folder / "transforms.json").unlink()
+    camera = open_sequence(folder).camera
+    assert camera.fx == pytest.approx(48 / np.tan(0.49))
+    assert (camera.cx, camera.cy) == (47.5, 35.5)

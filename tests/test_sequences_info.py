@@ -106,3 +106,53 @@ def test_real_recordings(shared_data: Path) -> None:
     kitchen = survey(shared_data / "redkitchen", SequenceSettings())
     assert "show the same picture" in said(kitchen)  # about a tenth, as its README says
     assert "little texture" in said(survey(shared_data / "fr3-notexture", SequenceSettings(), samples=20))
+
+
+def test_time_stamps_and_clocks_that_cannot_be(tmp_path: Path) -> None:
+    slow = look(tmp_path / "slow", images(6), [150.5 * i for i in range(6)])
+    assert "0.00664 frames per second over 752.5 s is not plausible" in slow.problems[0].what
+    write_tum(tmp_path / "tum", 6)
+    truth = tmp_path / "tum" / "groundtruth.txt"
+    lines = [line.split() for line in truth.read_text().splitlines() if not line.startswith("#")]
+    truth.write_text("".join(" ".join([f"{float(line[0]) + 3600:.6f}", *line[1:]]) + "\n" for line in lines))
+    assert "no frame has ground truth: frames are from 1341836537.5" in said(
+        survey(tmp_path / "tum", SequenceSettings())
+    )
+
+
+def test_the_real_fault_of_black_frames_comes_first(tmp_path: Path) -> None:
+    findings = look(tmp_path, [np.full((72, 96), 1, np.uint8) for _ in range(10)])
+    assert "very dark" in findings.problems[0].what
+    assert "same picture" not in said(findings)
+    assert "blurred" not in said(findings)
+
+
+def test_what_never_moves_is_noticed(tmp_path: Path) -> None:
+    pictures = [np.ascontiguousarray(p) for p in images(14)]
+    for picture in pictures:
+        picture[60:, :] = texture(9)[:12, :96]  # a bonnet
+    findings = look(tmp_path / "overlay", pictures)
+    assert findings.facts["still"] == pytest.approx(12 / 72, abs=0.05)
+    assert "never changes while the rest does" in said(findings)
+    assert look(tmp_path / "plain", images(14)).facts["still"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("numbers", "what"),
+    [("90,91,20,36.5", "principal point"), ("90,130,47,36.5", "not square"), ("9,9,47,36.5", "few lenses")],
+)
+def test_implausible_cameras_are_noticed(tmp_path: Path, numbers: str, what: str) -> None:
+    write_tum(tmp_path, 3)
+    assert what in said(survey(tmp_path, SequenceSettings(camera=numbers)))
+
+
+@pytest.mark.parametrize("kind", ["tum", "images"])
+def test_a_bad_camera_argument_is_an_error_for_every_format(
+    tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_tum(tmp_path, 3) if kind == "tum" else write_images(tmp_path, images(3))
+    (tmp_path / "own.yaml").write_text("fx: 1\n")
+    assert main(["info", str(tmp_path), "--camera", str(tmp_path / "own.yaml")]) == 2
+    assert "own.yaml: has no fy" in capsys.readouterr().err
+    assert main(["info", str(tmp_path), "--camera", "90,91,47,36.5,-0.123456789,0,0,0"]) == 0
+    assert "-0.123456789" in capsys.readouterr().out

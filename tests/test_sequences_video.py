@@ -78,7 +78,7 @@ def test_mp4_without_its_index_is_a_one_line_error(tmp_path: Path) -> None:
     write_video(tmp_path / "v.mp4", images(COUNT), codec="mp4v")
     data = (tmp_path / "v.mp4").read_bytes()
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) // 2])
-    with pytest.raises(InputError, match=r"cut.mp4: cannot be opened as a video"):
+    with pytest.raises(InputError, match=r"cut.mp4: has no index, so the recording was cut off"):
         open_sequence(tmp_path / "cut.mp4", fov=60.0)
 
 
@@ -175,3 +175,23 @@ def test_variable_frame_rate_has_its_true_times(tmp_path: Path) -> None:
     np.testing.assert_allclose(sequence.times, expected, atol=2e-6)
     for i in np.random.default_rng(1).permutation(30).tolist():
         assert (sequence[i].image == in_order[i].image).all(), i
+
+
+def test_a_colon_in_a_name_is_no_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_video(tmp_path / "2026-09-01T12:30:00.avi", images(4))
+    monkeypatch.chdir(tmp_path)
+    assert len(list(open_sequence("2026-09-01T12:30:00.avi", fov=60.0))) == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "codec"),
+    [
+        ("a.mp4", b"ftypisom....moov" + b"stsd" + bytes(12) + b"av01" + bytes(80), "AV1"),
+        ("a.mov", b"ftypqt  ....moov" + b"stsd" + bytes(12) + b"apch" + bytes(80), "ProRes"),
+        ("a.mkv", b"\x1aE\xdf\xa3" + bytes(40) + b"V_MPEGH/ISO/HEVC" + bytes(80), "HEVC"),
+    ],
+)
+def test_a_codec_that_cannot_be_decoded_is_named(tmp_path: Path, name: str, content: bytes, codec: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=rf"{name}: its codec, {codec}.*ffmpeg -i {name}"):
+        open_sequence(tmp_path / name, fov=60.0)

@@ -96,3 +96,29 @@ def test_sequence_delivers_the_undistorted_resized_view(tmp_path: Path) -> None:
     np.testing.assert_array_equal(sequence[1].image, expected.image(images(2)[1]))
     assert "undistorted" in sequence.view
     assert "48x36" in sequence.view
+
+
+WIDE = Camera(160, 160, 54.0, 54.0, 79.5, 79.5, (0.0, 0.0, 0.0, 0.0), "fisheye")  # 170 degrees
+
+
+def field(view: Rectifier) -> float:
+    return float(2 * np.degrees(np.arctan(0.5 * view.camera.width / view.camera.fx)))
+
+
+def test_a_fisheye_keeps_the_resolution_of_its_middle() -> None:
+    view = Rectifier(WIDE)
+    assert view.camera.fx == pytest.approx(WIDE.fx)
+    assert "--undistorted-fov shows up to 169" in view.description
+    short = Rectifier(replace(WIDE, fx=30.0, fy=30.0))
+    assert field(short) == pytest.approx(120.0)  # beyond that even the middle is given up
+    assert Rectifier(BROWN).zoom < 1  # an ordinary lens is seen whole
+
+
+def test_the_undistorted_field_of_view_can_be_chosen() -> None:
+    assert field(Rectifier(WIDE, fov=150.0)) == pytest.approx(150.0)
+    assert field(Rectifier(WIDE, fov=60.0)) == pytest.approx(60.0)
+    widest = Rectifier(WIDE, fov=178.0)  # as far as the picture goes
+    assert 165 < field(widest) < 178
+    assert "--undistorted-fov" not in widest.description
+    with pytest.raises(InputError, match="--undistorted-fov 200: must be between"):
+        Rectifier(WIDE, fov=200.0)

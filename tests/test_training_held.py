@@ -34,7 +34,8 @@ from improvo.training.settings import (  # noqa: E402
     PhotometricSettings,
     ViewSettings,
 )
-from improvo.training.trainer import Stage, Trainer  # noqa: E402
+from improvo.training.stage import Stage  # noqa: E402
+from improvo.training.trainer import Trainer  # noqa: E402
 from improvo.training.views import inside, warp_image, warp_points  # noqa: E402
 
 CPU = torch.device("cpu")

@@ -14,6 +14,7 @@ torch = pytest.importorskip("torch", reason="training needs the extra `train`")
 
 from improvo.cli.main import main  # noqa: E402
 from improvo.frontend.architecture import Architecture  # noqa: E402
+from improvo.frontend.runtime_torch import load_network  # noqa: E402
 from improvo.frontend.superpoint import SuperPoint, sample_stability  # noqa: E402
 from improvo.frontend.weights import ModelCard, load_weights, save_weights  # noqa: E402
 from improvo.labeling.labeled import read_labels  # noqa: E402
@@ -28,7 +29,6 @@ from improvo.training.settings import (  # noqa: E402
     PairSettings,
     ViewSettings,
 )
-from improvo.training.stages import loaded  # noqa: E402
 from improvo.training.tracked_pairs import TrackedPairs  # noqa: E402
 from labeled_scene import (  # noqa: E402
     CAMERA,
@@ -250,7 +250,7 @@ def test_the_command_teaches_stability_and_says_so_on_the_card(
     weights = load_weights(tmp_path / "out" / "weights.safetensors")
     assert weights.card.training["stability_trained"] is True
     assert weights.card.training["start"] == "tiny.safetensors"
-    network = loaded(weights)
+    network = load_network(weights)
     known = frames_of(store, PAPER).points(5)
     with torch.inference_mode():
         image = torch.from_numpy(draw(5)[None, None]).float() / 255

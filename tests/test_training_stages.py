@@ -17,11 +17,10 @@ from improvo.cli.main import main  # noqa: E402
 from improvo.frontend.architecture import ARCHITECTURES, Architecture  # noqa: E402
 from improvo.frontend.superpoint import SuperPoint  # noqa: E402
 from improvo.frontend.weights import load_weights  # noqa: E402
-from improvo.training.homographies import JointStage  # noqa: E402
 from improvo.training.losses import detector_loss, hinge_loss, info_nce_loss  # noqa: E402
-from improvo.training.magic_point import MagicPointStage  # noqa: E402
 from improvo.training.pairs import PairBatches  # noqa: E402
 from improvo.training.settings import HomographiesSettings, OptimiserSettings, ShapesSettings, ViewSettings  # noqa: E402
+from improvo.training.superpoint_stages import JointStage, MagicPointStage  # noqa: E402
 from improvo.training.synthetic import ShapeBatches, shape_source  # noqa: E402
 from improvo.training.trainer import DivergedError, Trainer  # noqa: E402
 from improvo.training.widen import widen  # noqa: E402

@@ -17,6 +17,7 @@ import logging
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from improvo.depth.run_settings import DenseRunSettings
     from improvo.errors import ConfigError, ImprovoError, InputError, MissingExtraError, OutputError
     from improvo.evaluation.settings import PoseSettings, TrajectorySettings
     from improvo.frontend import Frontend
@@ -72,6 +73,7 @@ _PUBLIC = {
     "OdometrySettings": "improvo.odometry.settings",
     "LabelSettings": "improvo.stability.settings",
     "RunSettings": "improvo.odometry.run_settings",
+    "DenseRunSettings": "improvo.depth.run_settings",
     "LabelRunSettings": "improvo.odometry.run_settings",
     "OdometryTrainingSettings": "improvo.training.settings",
     "ImproveSettings": "improvo.improvement.settings",
@@ -88,6 +90,7 @@ _PUBLIC = {
 __all__ = [
     "Camera",
     "ConfigError",
+    "DenseRunSettings",
     "Features",
     "Frame",
     "Frontend",

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from improvo.errors import ConfigError
+from improvo.untrusted.text import load_yaml, reason
 
 T = TypeVar("T")
+_LONGEST_VALUE = 60  # characters of a value in a message
 
 # Settings that were renamed: the section, what a setting there was called, and what it is called now. Files that were
 # written under a former name stay readable.
@@ -27,6 +29,7 @@ FORMER_NAMES: dict[str, dict[str, str]] = {
     "start": {"max_waiting": "max_buffered", "max_patience": "max_cooldown"},
     "window": {"constants": "fixed"},
     "health": {"young_frames": "provisional_frames"},
+    "pairs": {"rehearsed_share": "replay_share"},
 }
 
 
@@ -61,17 +64,14 @@ def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = (), 
     Raises:
         ConfigError: a file that is no YAML mapping, an unknown key, or a value of the wrong type.
     """
-    import yaml
-
     section = section_of(cls)
     merged: dict[str, Any] = {}
     if path is not None:
         try:
-            loaded = yaml.safe_load(path.read_text()) or {}
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            reason = str(error).splitlines()[0]
+            loaded = load_yaml(path.read_text(encoding="utf-8")) or {}
+        except (OSError, ValueError) as error:
             raise ConfigError(
-                f"{path}: cannot be read as YAML ({reason}); `improvo config` prints a valid file"
+                f"{path}: cannot be read as YAML ({reason(error)}); `improvo config` prints a valid file"
             ) from None
         if not isinstance(loaded, dict):
             raise ConfigError(f"{path}: must hold `key: value` pairs; `improvo config` prints a valid file")
@@ -88,8 +88,8 @@ def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = (), 
             if not isinstance(target, dict):
                 raise ConfigError(f"--set {override}: {part} is a value, not a section")
         try:
-            target[_present_name(below, leaf)] = yaml.safe_load(text)
-        except yaml.YAMLError:
+            target[_present_name(below, leaf)] = load_yaml(text)
+        except ValueError:
             raise ConfigError(f"--set {override}: the value is not readable") from None
     return from_dict(cls, merged, str(path) if path else "settings", base)
 
@@ -125,8 +125,8 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings", bas
         return converter.structure(values, cls)
     except ClassValidationError as error:
         raise ConfigError(f"{where}: {_first_reason(error)}") from None
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{where}: {error}") from None
+    except (TypeError, ValueError, OverflowError, AttributeError, LookupError) as error:
+        raise ConfigError(f"{where}: {reason(error)}") from None
 
 
 def with_present_names(values: Any, section: str = "") -> Any:
@@ -147,7 +147,7 @@ def with_present_names(values: Any, section: str = "") -> Any:
 
 
 def _present_name(section: str, key: Any) -> Any:
-    return FORMER_NAMES.get(section, {}).get(key, key)
+    return FORMER_NAMES.get(section, {}).get(key, key) if isinstance(section, str) and isinstance(key, str) else key
 
 
 def section_of(cls: type) -> str:
@@ -173,13 +173,25 @@ def _strict(kind: type) -> Any:
 
     def structure(value: Any, _: Any) -> Any:
         if kind is float and isinstance(value, str):  # YAML takes 3e-4, without a point, for a word
-            with contextlib.suppress(ValueError):
+            with contextlib.suppress(ValueError, OverflowError):
                 return float(value)
         if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
-            raise ValueError(f"{value!r} is not of type {kind.__name__}")
-        return kind(value)
+            raise ValueError(f"{_shown(value)} is not of type {kind.__name__}")
+        try:
+            return kind(value)
+        except OverflowError:
+            raise ValueError(f"{_shown(value)} is too large") from None
 
     return structure
+
+
+def _shown(value: Any) -> str:
+    """A value in a message, shortened; a number may have thousands of digits, more than Python writes."""
+    try:
+        text = repr(value)
+    except ValueError:
+        return "a number of thousands of digits"
+    return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}..."
 
 
 def _refuse_unknown_keys(cls: type, values: Any, where: str, prefix: str) -> None:
@@ -191,9 +203,10 @@ def _refuse_unknown_keys(cls: type, values: Any, where: str, prefix: str) -> Non
     known = {f.name: hints[f.name] for f in dataclasses.fields(cls)}
     for key, value in values.items():
         if key not in known:
-            close = difflib.get_close_matches(str(key), known, n=1)
+            shown = key if isinstance(key, str) and len(key) <= _LONGEST_VALUE else _shown(key)
+            close = difflib.get_close_matches(shown, known, n=1)
             mend = f"did you mean `{prefix}{close[0]}`?" if close else f"known: {', '.join(known)}"
-            raise ConfigError(f"{where}: unknown setting `{prefix}{key}`; {mend}")
+            raise ConfigError(f"{where}: unknown setting `{prefix}{shown}`; {mend}")
         if dataclasses.is_dataclass(known[key]):
             _refuse_unknown_keys(known[key], value, where, f"{prefix}{key}.")
 
@@ -204,4 +217,6 @@ def _first_reason(error: Any) -> str:
     while getattr(error, "exceptions", None):
         error = error.exceptions[0]
         path += [str(note).rsplit(" ", 1)[-1] for note in getattr(error, "__notes__", []) if "attribute" in note]
-    return f"setting `{'.'.join(path)}`: {error}" if path else str(error)
+    where = ".".join(path)
+    named = not path or f"`{where}." in str(error) or f"`{where}`" in str(error)
+    return str(error) if named else f"setting `{where}`: {error}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 from improvo import config
 from improvo.errors import ConfigError, InputError
 from improvo.files import write_json, write_text
+from improvo.untrusted.text import load_json, load_yaml
 
 _LONGEST_VALUE = 60  # characters of a value in a message
 
@@ -39,15 +39,15 @@ class SettingsRecord:
         Raises:
             InputError: the file is damaged.
         """
-        import yaml
-
         if not self.path.is_file():
             return None
         try:
-            text = self.path.read_text()
-            values = json.loads(text) if self.path.suffix == ".json" else yaml.safe_load(text)
-        except (OSError, ValueError, yaml.YAMLError):
-            raise InputError(f"{self.path}: is damaged; choose another output folder") from None
+            text = self.path.read_text(encoding="utf-8")
+            values = load_json(text) if self.path.suffix == ".json" else load_yaml(text)
+        except (OSError, ValueError):
+            values = None
+        if values is None:
+            raise InputError(f"{self.path}: is damaged; choose another output folder")
         return config.with_present_names(values, self._section)
 
     def difference(self, settings: Any) -> str:

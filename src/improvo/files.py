@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from improvo.errors import OutputError
+from improvo.errors import InputError, OutputError
+from improvo.untrusted.paths import check_path
+from improvo.untrusted.text import load_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,6 +22,9 @@ if TYPE_CHECKING:
 
 MARKER = ".improvo.json"
 FORMER_NAME = "sivo"  # of this package; folders and weights written under it stay readable
+_TEMPORARY = re.compile(r"\..+\.(\d+)(?:-\w+)?\.partial(?:\..*)?", re.DOTALL)  # .NAME.PROCESS-CHANCE.partial.SUFFIX
+_LONGEST_NAME = 100  # characters of a name that go into that of its temporary file
+_open_here: set[str] = set()  # names of temporary files and folders that this process is writing
 
 
 @contextmanager
@@ -25,22 +33,63 @@ def written_atomically(path: Path) -> Iterator[Path]:
 
     The folder is made where it is missing, so that nothing needs to be made before there is something to write.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial{path.suffix}")
+    temporary = path.with_name(temporary_name(path.name, path.suffix))
+    made = False
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        # a new file, never what lies or is linked there under this name
+        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0), 0o666))
+        made = True
+        _open_here.add(temporary.name)
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error}); choose another folder") from None
     finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
+        _open_here.discard(temporary.name)
+        if made:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+
+
+def temporary_name(name: str, suffix: str = "") -> str:
+    """A hidden name for what is not complete; nobody can guess it, and `clear_leftovers` knows whose it was."""
+    return f".{name[:_LONGEST_NAME]}.{os.getpid()}-{secrets.token_hex(4)}.partial{suffix[:20]}"
+
+
+def clear_leftovers(folder: Path) -> None:
+    """Remove what killed processes left half-written in a folder of ours, and below it."""
+    for place, folders, names in os.walk(folder):
+        for name in [*names, *folders]:
+            match = _TEMPORARY.fullmatch(name)
+            if match is None or name in _open_here or _is_running(int(match.group(1)[:9])):
+                continue
+            leftover = Path(place) / name
+            if leftover.is_dir() and not leftover.is_symlink():
+                shutil.rmtree(leftover, ignore_errors=True)
+            else:
+                with suppress(OSError):
+                    leftover.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    """Whether another process has this number."""
+    if process == os.getpid() or os.name != "posix":
+        return False
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically."""
     with written_atomically(path) as temporary:
-        temporary.write_text(text)
+        # names of files may hold bytes that are no text
+        temporary.write_text(text, encoding="utf-8", errors="surrogateescape")
 
 
 def write_json(path: Path, data: Any) -> None:
@@ -64,6 +113,10 @@ def check_output_folder(path: Path, command: str) -> None:
     Raises:
         OutputError: the path is a file, a folder with other content, or cannot be written.
     """
+    try:
+        check_path(path)
+    except InputError as error:
+        raise OutputError(str(error)) from None
     if path.exists() and not path.is_dir():
         raise OutputError(f"{path}: is a file, not a folder; choose another output folder")
     if path.is_dir() and any(not _is_temporary(entry) for entry in path.iterdir()):
@@ -84,6 +137,7 @@ def make_output_folder(path: Path, command: str) -> None:
     except OSError as error:
         raise OutputError(f"{path}: cannot be created ({error.strerror}); choose another output folder") from None
     write_json(path / MARKER, {"made_by": command})
+    clear_leftovers(path)
 
 
 def _is_temporary(path: Path) -> bool:
@@ -95,9 +149,9 @@ def _owner(path: Path) -> str | None:
     """The command that made a folder; None where no marker says so."""
     for name in (MARKER, f".{FORMER_NAME}.json"):
         try:
-            marker = json.loads((path / name).read_text())
+            marker = load_json((path / name).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             continue
-        if isinstance(marker, dict):
-            return marker.get("made_by")
+        if isinstance(marker, dict) and isinstance(marker.get("made_by"), str):
+            return str(marker["made_by"])
     return None

@@ -1,7 +1,8 @@
 """Presets: whole settings under a name, one registry for all commands.
 
 `paper` is what the paper fixes and nothing else: the mode, unit depth, its objective and iterations, raw labels, pairs
-uniform within 60 frames, the plain losses, OpenCV's solver. What it leaves open, such as the frontend, stays as it is.
+uniform within 60 frames, the plain losses, OpenCV's solver. What it leaves open, such as the frontend and the weights
+of the losses, stays as it is.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from improvo.evaluation.settings import PoseCommandSettings, VoCommandSettings
     from improvo.improvement.settings import ImproveSettings
     from improvo.odometry.run_settings import LabelRunSettings, RunSettings
-    from improvo.training.settings import OdometryTrainingSettings
+    from improvo.training.settings import HomographiesSettings, OdometryTrainingSettings, ShapesSettings
 
 T = TypeVar("T")
 PAPER = "paper"
@@ -65,8 +66,22 @@ def _paper_label() -> LabelRunSettings:
     return paper_run_settings(LabelRunSettings())
 
 
+def _paper_shapes() -> ShapesSettings:
+    from improvo.training.settings import DetectorLossSettings, ShapesSettings
+
+    return ShapesSettings(detector=DetectorLossSettings(position_weight=0.0))
+
+
+def _paper_homographies() -> HomographiesSettings:
+    from improvo.training.settings import HINGE, DetectorLossSettings, HomographiesSettings
+
+    plain = DetectorLossSettings(position_weight=0.0)
+    return HomographiesSettings(detector=plain, descriptor_loss=HINGE, shapes=0)
+
+
 def _paper_training() -> OdometryTrainingSettings:
     from improvo.training.settings import (
+        HINGE,
         DetectorLossSettings,
         LandmarkSettings,
         OdometryTrainingSettings,
@@ -74,8 +89,10 @@ def _paper_training() -> OdometryTrainingSettings:
     )
 
     return OdometryTrainingSettings(
+        descriptor_loss=HINGE,
+        stability_balanced=False,
         detector=DetectorLossSettings(position_weight=0.0),
-        pairs=PairSettings(wide_baselines=0.0, same_frame_share=0.0, untracked_is_background=False),
+        pairs=PairSettings(largest_gap=60, wide_baselines=0.0, same_frame_share=0.0, least_points=0),
         landmarks=LandmarkSettings(
             shared=False, unseen=False, reprojected=False, unstable_median_error=0.0, unstable_largest_step=1.0
         ),
@@ -115,6 +132,8 @@ _PRESETS: dict[str, dict[str, Callable[[], Any]]] = {
     "RunSettings": {PAPER: _paper_run},
     "DenseRunSettings": {PAPER: _paper_dense_run},
     "LabelRunSettings": {PAPER: _paper_label},
+    "ShapesSettings": {PAPER: _paper_shapes},
+    "HomographiesSettings": {PAPER: _paper_homographies},
     "OdometryTrainingSettings": {PAPER: _paper_training},
     "ImproveSettings": {PAPER: _paper_improve},
     "PoseCommandSettings": {PAPER: _paper_pose},

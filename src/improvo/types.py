@@ -15,6 +15,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 UInt8 = NDArray[np.uint8]
+Mask = NDArray[np.bool_]  # (H, W) True where a picture is used
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class Frame:
     time: float  # seconds, the recording's own clock
     image: UInt8  # (H, W)
     source: str  # the file, or "video.mp4#123"
+    mask: Mask | None = None  # (H, W) where keypoints may be; None is everywhere
 
 
 @dataclass(frozen=True)

@@ -39,13 +39,16 @@ def run(
     Args:
         sequence: an open sequence, or the path of anything that `open_sequence` recognises.
         output: folder for trajectory, map, tracks, labels and report.
-        settings: all numbers; `preset(RunSettings, "paper")` has the paper's.
+        settings: all numbers; `preset(RunSettings, "paper")` has the paper's. With `DenseRunSettings(dense=True)` the
+            folder gets depth maps and a cloud too.
         frontend: in place of the one that the settings name.
 
     Raises:
-        InputError: the sequence cannot be opened or has too few frames.
+        InputError: the sequence cannot be opened, has too few frames, or is live where depth is wanted.
         OutputError: the folder cannot be used.
     """
+    from improvo.depth.dense import refuse_live, write_dense
+    from improvo.depth.run_settings import DenseRunSettings
     from improvo.labeling.labeler import run_and_label
     from improvo.odometry.run_settings import RunSettings
     from improvo.sequences import open_sequence
@@ -53,7 +56,13 @@ def run(
     settings = settings or RunSettings()
     if isinstance(sequence, str | Path):
         sequence = open_sequence(sequence, settings.sequence)
-    return run_and_label(sequence, Path(output), settings, frontend=frontend)
+    depth = settings.depth if isinstance(settings, DenseRunSettings) and settings.dense else None
+    if depth is not None:
+        refuse_live(sequence)
+    result = run_and_label(sequence, Path(output), settings, frontend=frontend)
+    if depth is not None:
+        write_dense(sequence, result, depth)
+    return result
 
 
 def label(

@@ -18,6 +18,7 @@ from improvo.cli.options import add_config_arguments, add_sequence_arguments, se
 from improvo.cli.output import figures, next_step, say
 from improvo.errors import ImprovoError, InputError
 from improvo.evaluation.settings import ESTIMATORS, SAMPLINGS, PoseCommandSettings, PoseSettings
+from improvo.untrusted.text import read_json_file
 
 if TYPE_CHECKING:
     from improvo.evaluation.sources import FeatureSource, Recorded
@@ -108,10 +109,10 @@ def read_results(path: Path) -> dict[str, Any]:
         InputError: not such a file.
     """
     try:
-        results: dict[str, Any] = json.loads(path.read_text())
-        if results["protocol"] != "pose" or not results["rows"]:
+        results = read_json_file(path, "evaluate again")
+        if results["protocol"] != "pose" or not isinstance(results["rows"], list) or not results["rows"]:
             raise KeyError
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, KeyError, InputError):
         raise InputError(f"{path}: is no pose.json of `improvo evaluate pose`; check the path") from None
     return results
 

@@ -108,7 +108,7 @@ def run(arguments: argparse.Namespace) -> int | None:
 def read_pair(
     estimate_path: Path, truth_path: Path, sequence: SequenceSettings | None = None, reference: str | None = None
 ) -> tuple[Trajectory, Trajectory, tuple[str, ...]]:
-    """Both trajectories, and what was odd in their files. Two KITTI files of one length count the same frames.
+    """Both trajectories, and what was odd in their files. KITTI rows without times count the other's rows.
 
     Args:
         estimate_path: a trajectory file, or the folder of a run.
@@ -117,14 +117,23 @@ def read_pair(
         reference: true poses that replace those of the sequence.
 
     Raises:
-        InputError: a file that is no trajectory, a folder without one, a sequence without true poses.
+        InputError: a file that is no trajectory, a folder without one, a sequence without true poses, or KITTI rows
+            without times of which the other has another number.
     """
     from improvo.evaluation.truth.reference import lacks_times
     from improvo.evaluation.truth.referenced import open_with_truth
-    from improvo.geometry.trajectory_files import read_trajectory_report
-    from improvo.sequences import open_sequence
-    from improvo.types import Trajectory
+    from improvo.geometry.trajectory_files import has_times, read_trajectory_report
+    from improvo.odometry.run_folder import RunFolder, why_no_pose
+    from improvo.sequences.opening import true_trajectory
 
+    if (estimate_path / "run.json").is_file():
+        without = why_no_pose(RunFolder(estimate_path).report)
+        if without is not None:
+            raise InputError(f"{estimate_path}: {without}")
+    estimate_path = estimate_path / "trajectory.txt" if estimate_path.is_dir() else estimate_path
+    if not estimate_path.exists():
+        raise InputError(f"{estimate_path}: no such file; give a trajectory file or the output folder of `improvo run`")
+    counted = not has_times(estimate_path)
     if reference is not None:
         truth = open_with_truth(truth_path, sequence or SequenceSettings(), reference).ground_truth
         truth_notes: tuple[str, ...] = ()
@@ -132,21 +141,30 @@ def read_pair(
     elif lacks_times(truth_path):
         raise InputError(f"{truth_path}: has no times; give the sequence as TRUTH, and this with --truth")
     elif truth_path.is_dir():
-        truth, truth_notes = open_sequence(truth_path, sequence).ground_truth, ()
+        truth, truth_notes = true_trajectory(truth_path, sequence), ()
         if truth is None:
             raise InputError(f"{truth_path}: has no true poses; give a trajectory file or a sequence that has them")
     else:
         truth, truth_notes = read_trajectory_report(truth_path)
-    if estimate_path.is_dir():
-        estimate_path = estimate_path / "trajectory.txt"
     estimate, estimate_notes = read_trajectory_report(estimate_path)
-    if _columns(estimate_path) == _columns(truth_path) == 12 and len(estimate) == len(truth):
-        estimate = Trajectory(truth.times, estimate.world_from_cam, estimate.segment)
+    if counted and len(estimate) == len(truth):
+        estimate, note = _at_rows_of(estimate, truth, estimate_path, truth_path)
+        return estimate, truth, (note, *truth_notes)
+    if not truth_path.is_dir() and not has_times(truth_path) and len(estimate) == len(truth):
+        truth, note = _at_rows_of(truth, estimate, truth_path, estimate_path)
+        return estimate, truth, (*estimate_notes, note)
+    for path, rows, other in ((estimate_path, len(estimate), len(truth)), (truth_path, len(truth), len(estimate))):
+        if path.is_file() and not has_times(path) and rows != other:
+            raise InputError(
+                f"{path}: has {rows} poses without times, and the other {other}; put a times.txt beside it, or give a "
+                "TUM file"
+            )
     return estimate, truth, (*estimate_notes, *truth_notes)
 
 
-def _columns(path: Path) -> int:
-    if not path.is_file():
-        return 0
-    lines = (line for line in path.read_text().splitlines() if line.strip() and not line.startswith("#"))
-    return len(next(lines, "").split())
+def _at_rows_of(counted: Trajectory, timed: Trajectory, path: Path, other: Path) -> tuple[Trajectory, str]:
+    """Poses without times at the times of the same number of other poses, and a note that says so."""
+    from improvo.types import Trajectory
+
+    note = f"{path}: has no times; its {len(timed)} poses are taken as the {len(timed)} of {other}, row by row"
+    return Trajectory(timed.times, counted.world_from_cam, counted.segment), note

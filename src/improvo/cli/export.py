@@ -38,9 +38,9 @@ def run_colmap(arguments: argparse.Namespace) -> None:
     models = [segment_model(run_folder, each, arguments.max_error, arguments.min_observations) for each in segments]
     make_output_folder(arguments.output, "export colmap")
     for number, model in enumerate(models):
-        grey = None if arguments.no_images else _write_images(run_folder, model, arguments.output / "images")
+        colours = None if arguments.no_images else _write_images(run_folder, model, arguments.output / "images")
         target = arguments.output / "sparse" / str(number)
-        write_colmap(model, run_folder.camera, target, grey)
+        write_colmap(model, run_folder.camera, target, colours)
         say(
             f"{target}: {len(model.frames)} images, {len(model.xyz)} points, {len(model.error)} observations, "
             f"mean re-projection error {model.mean_error:.6f} px"
@@ -64,8 +64,8 @@ def run_nerfstudio(arguments: argparse.Namespace) -> None:
     segments = segments_by_length(run_folder)
     model = segment_model(run_folder, segments[0], arguments.max_error, arguments.min_observations)
     make_output_folder(arguments.output, "export nerfstudio")
-    grey = _write_images(run_folder, model, arguments.output / "images")
-    write_nerfstudio(model, run_folder.camera, arguments.output, grey)
+    colours = _write_images(run_folder, model, arguments.output / "images")
+    write_nerfstudio(model, run_folder.camera, arguments.output, colours)
     say(f"{arguments.output / 'transforms.json'}: {len(model.frames)} images, {len(model.xyz)} points")
     if len(segments) > 1:
         left = run_folder.frames - len(model.frames)

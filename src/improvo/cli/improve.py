@@ -73,6 +73,7 @@ def _of_both_recipes(arguments: argparse.Namespace) -> list[str]:
         if hasattr(arguments, name):
             extra += [f"{recipe}.optimiser.{name}={getattr(arguments, name)}" for recipe in ("held", "training")]
     if hasattr(arguments, "steps"):
+        extra.append("steps_per_frame=0")
         extra += [f"{recipe}.optimiser.decay_steps={arguments.steps // 3}" for recipe in ("held", "training")]
         if arguments.steps < 1:
             raise ConfigError(f"--steps {arguments.steps}: must be at least 1")

@@ -8,7 +8,7 @@ from typing import Any
 
 from improvo.cli.flags import add_setting
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
-from improvo.cli.output import figures, next_step
+from improvo.cli.output import figures, next_step, say
 from improvo.sequences.settings import InfoSettings
 
 
@@ -16,6 +16,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `improvo info`."""
     parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a video, an image folder, a data set or a bag")
     add_setting(parser, InfoSettings(), "--samples", "samples", help="pairs of frames to look at")
+    parser.add_argument(
+        "--write-mask",
+        type=Path,
+        metavar="FILE",
+        help="write what never changes while the rest of the picture does as a mask, an image for --mask",
+    )
     add_sequence_arguments(parser)
     add_config_arguments(parser)
 
@@ -33,8 +39,24 @@ def run(arguments: argparse.Namespace) -> None:
     if not findings["problems"]:
         lines.append("nothing wrong was found")
     figures(findings, "\n".join(lines))
-    camera = "" if findings["camera"] else " --camera FILE"
-    next_step(f"`improvo run {arguments.sequence}{camera} -o out`")
+    options = "" if findings["camera"] else " --camera FILE"
+    if arguments.write_mask is not None:
+        say(_write_mask(arguments, settings))
+        options += f" --mask {arguments.write_mask}"
+    next_step(f"`improvo run {arguments.sequence}{options} -o out`")
+
+
+def _write_mask(arguments: argparse.Namespace, settings: InfoSettings) -> str:
+    """Write the mask of what never changes; what was written, in words."""
+    from improvo.files import write_png
+    from improvo.sequences.opening import open_recording
+    from improvo.sequences.sequence import selected
+    from improvo.sequences.still import still_mask
+
+    recording = open_recording(arguments.sequence, settings.sequence)
+    mask = still_mask(recording, selected(recording, settings.sequence), settings.samples)
+    write_png(arguments.write_mask, mask[..., None].repeat(3, axis=2))
+    return f"mask in {arguments.write_mask}: {100 * float((mask == 0).mean()):.1f} % is black; look at it before use"
 
 
 def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
@@ -72,5 +94,6 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
 def _camera(camera: dict[str, Any]) -> str:
     text = f"fx {camera['fx']:.6g}, fy {camera['fy']:.6g}, cx {camera['cx']:.6g}, cy {camera['cy']:.6g}"
     if camera["distortion"]:
-        text += f", {camera['distortion_model']} {[round(value, 5) for value in camera['distortion']]}"
+        values = ", ".join(f"{value:.9g}" for value in camera["distortion"])
+        text += f", {camera['distortion_model']} [{values}]"
     return text

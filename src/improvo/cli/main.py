@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import tempfile
 from collections.abc import Sequence
+from pathlib import Path
 
 from improvo import __version__
 from improvo.cli import output
@@ -34,8 +36,10 @@ class _Text(HelpFormatter, argparse.RawDescriptionHelpFormatter):
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point. Returns the exit status: 0 done, 2 an error that the user can mend, 130 interrupted."""
     words = list(sys.argv[1:] if argv is None else argv)
+    os.environ.setdefault("MPLCONFIGDIR", str(cache_folder() / "matplotlib"))  # made by matplotlib, if it is used
     try:
         arguments = parser_for(words).parse_args(words)
+        _check_paths(arguments)
         with output.configured(arguments.quiet, getattr(arguments, "json", False)), termination_interrupts():
             return int(arguments.run_command(arguments) or 0)
     except ImprovoError as error:
@@ -47,6 +51,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+
+
+def _check_paths(arguments: argparse.Namespace) -> None:
+    """Refuse a path that no system can look up, before any command does.
+
+    Raises:
+        InputError: one of them is.
+    """
+    from improvo.untrusted.paths import check_path
+
+    for value in vars(arguments).values():
+        for item in value if isinstance(value, list | tuple) else [value]:
+            if isinstance(item, Path):
+                check_path(item)
+
+
+def cache_folder() -> Path:
+    """Where the command line may keep what makes a second run faster; made when something is kept."""
+    given = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
+    try:
+        return Path(given or Path.home() / ".cache") / "improvo"
+    except RuntimeError:  # a user without a home
+        return Path(tempfile.gettempdir()) / "improvo"
 
 
 def parser_for(words: Sequence[str]) -> argparse.ArgumentParser:

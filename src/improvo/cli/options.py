@@ -24,8 +24,14 @@ _SEQUENCE_OPTIONS: dict[str, dict[str, Any]] = {
     "end": {"help": "one past the last frame of the recording (default: all)"},
     "stride": {},
     "max_frames": {"help": "at most so many, after the stride (default: all)"},
+    "undistorted_fov": {
+        "metavar": "DEGREES",
+        "help": "how much of a distorted wide lens is seen (default: all up to 120, beyond that what keeps the "
+        "resolution in the middle)",
+    },
     "width": {"metavar": "PIXELS", "help": "resize to this width (default: as recorded)"},
     "topic": {"metavar": "NAME"},
+    "mask": {"metavar": "FILE"},
 }
 
 

@@ -65,6 +65,8 @@ def run(arguments: argparse.Namespace) -> int:
         f"{sequence.name}: {sequence.format}, {frames} of {camera.width}x{camera.height}; "
         f"frontend {settings.frontend.name}; poses and map are up to scale"
     )
+    for note in sequence.notes:
+        say(f"note: {note}")
     summary = _track(sequence, arguments.output, settings, _viewer(arguments))
     figures(_figures(summary), "")
     _print_summary(summary)
@@ -133,6 +135,8 @@ def _figures(summary: LabeledRun) -> dict[str, Any]:
 
 
 def _print_summary(summary: LabeledRun) -> None:
+    from improvo.odometry.run_folder import why_no_pose
+
     report = summary.report
     frames, segments = report["frames"], report["segments"]
     say(
@@ -151,4 +155,5 @@ def _print_summary(summary: LabeledRun) -> None:
         say(f"  {len(skipped)} frame(s) could not be read, first {skipped[0]['source']}: {skipped[0]['reason']}")
     if report["interrupted"]:
         say("  interrupted: the result ends there, and is complete up to there")
-    say(f"results in {summary.folder}")
+    without = why_no_pose(report)
+    say(f"results in {summary.folder}" if without is None else f"{without}; details in {summary.folder / 'run.json'}")

@@ -21,6 +21,7 @@ from improvo.errors import InputError
 
 if TYPE_CHECKING:
     from improvo.sequences import Sequence
+    from improvo.types import UInt8
 
 
 def add_stability_arguments(parser: argparse.ArgumentParser) -> None:
@@ -49,13 +50,12 @@ def run_stability(arguments: argparse.Namespace) -> None:
     frames = asked_frames(arguments, len(sequence))
     times = sequence.times
     fps = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 30.0
-    write_pictures(
-        arguments,
-        Path(),
-        frames,
-        lambda frame: paint_stability(sequence[frame].image, frontend, f"frame {frame}, {shown_name}", colours),
-        fps,
-    )
+
+    def painted(number: int) -> UInt8:
+        frame = sequence[number]
+        return paint_stability(frame.image, frontend, f"frame {number}, {shown_name}", colours, mask=frame.mask)
+
+    write_pictures(arguments, Path(), frames, painted, fps)
     next_step("open it")
 
 
@@ -82,16 +82,17 @@ def run_matches(arguments: argparse.Namespace) -> None:
     pair = chosen_frames(arguments.pair, len(sequence))
     if len(pair) != 2 or "," not in arguments.pair:
         raise InputError(f"--pair {arguments.pair}: give two frames, such as 0,30")
-    image_a, image_b = (sequence[frame].image for frame in pair)
+    frame_a, frame_b = (sequence[frame] for frame in pair)
     depth_a = sequence.depth(pair[0])
     rows = [
         paint_matches(
             load_frontend(name, arguments.max_keypoints, opencv_defaults=True),
-            image_a,
-            image_b,
+            frame_a.image,
+            frame_b.image,
             depth_a,
             sequence.camera,
             palette(arguments.palette),
+            masks=(frame_a.mask, frame_b.mask),
         )
         for name in arguments.frontends.split(",")
     ]

@@ -12,6 +12,7 @@ from improvo.cli.train_options import (
     add_training_arguments,
     print_metrics,
     read_data_card,
+    say_skipped,
     starting_weights,
 )
 from improvo.files import check_output_folder
@@ -76,6 +77,7 @@ def run_homographies(arguments: argparse.Namespace) -> None:
         starting_weights(arguments.parent),
         starting_weights(arguments.detector),
         data,
+        on_pictures=say_skipped,
     )
     weights = arguments.output / "weights.safetensors"
     print_metrics(arguments.output, metrics, f"`improvo run SEQUENCE --frontend {weights} -o out` uses them")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,9 +10,11 @@ from improvo.cli.flags import add_setting
 from improvo.cli.options import add_config_arguments
 from improvo.cli.output import figures, next_step, say
 from improvo.errors import InputError
+from improvo.untrusted.text import load_json, reason
 
 if TYPE_CHECKING:
     from improvo.frontend.weights import DataSource
+    from improvo.training.pictures import Pictures
 
 
 def add_training_arguments(parser: argparse.ArgumentParser, defaults: Any, parent: str | None = None) -> None:
@@ -67,9 +68,13 @@ def read_data_card(path: Path | None) -> tuple[DataSource, ...]:
     from improvo.frontend.weights import DataSource
 
     try:
-        return tuple(DataSource(**entry) for entry in json.loads(path.read_text()))
+        sources = tuple(DataSource(**entry) for entry in load_json(path.read_text(encoding="utf-8")))
+        if not all(isinstance(text, str) for one in sources for text in (one.name, one.licence, one.attribution)):
+            raise ValueError("something else than words")
     except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"{path}: must be a JSON list of objects with name, licence, attribution ({error})") from None
+        words = "a JSON list of objects with name, licence, attribution"
+        raise InputError(f"{path}: must be {words} ({reason(error)})") from None
+    return sources
 
 
 def starting_weights(parent: str | None) -> Path | None:
@@ -83,6 +88,14 @@ def starting_weights(parent: str | None) -> Path | None:
     from improvo.frontend.weights import find_weights
 
     return find_weights(parent)
+
+
+def say_skipped(pictures: Pictures) -> None:
+    """Name the pictures that could not be read."""
+    for name in pictures.skipped:
+        say(f"skipped {name}: cannot be read")
+    if pictures.skipped:
+        say(f"{len(pictures.skipped)} pictures skipped, {len(pictures)} read")
 
 
 def print_metrics(output: Path, metrics: dict[str, Any], then: str) -> None:

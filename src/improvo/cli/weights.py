@@ -58,10 +58,10 @@ def run_import(arguments: argparse.Namespace) -> None:
 
 def run_calibrate(arguments: argparse.Namespace) -> None:
     """Measure activation ranges and write them beside the weights."""
-    import cv2
-
     from improvo.frontend.quantisation import calibrate
     from improvo.frontend.weights import find_weights, load_weights, save_weights
+    from improvo.sequences.base import UnreadableFrameError
+    from improvo.sequences.images import read_grey
     from improvo.terminal import progress
 
     output = _checked_output(arguments.output)
@@ -75,8 +75,9 @@ def run_calibrate(arguments: argparse.Namespace) -> None:
     def readable() -> Iterator[UInt8]:
         for path in paths:
             shown.advance()
-            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-            if image is None:
+            try:
+                image = read_grey(path)
+            except UnreadableFrameError:
                 unreadable.append(path)
             else:
                 yield image

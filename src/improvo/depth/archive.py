@@ -20,7 +20,11 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.files import written_atomically
+from improvo.sequences.base import UnreadableFrameError
+from improvo.sequences.images import decode
 from improvo.types import Float32, Float64
+from improvo.untrusted.arrays import FAULTS
+from improvo.untrusted.text import load_json, reason
 
 DEPTH_FILE = "depth.zip"
 _ABOUT = "depth.json"
@@ -94,15 +98,17 @@ class DepthReader:
             self.frames: list[int] = [int(frame) for frame in about["frames"]]  # frame_index of each map
             self.scale = float(about["scale"])  # values per unit of depth
             self.K: Float64 = np.array(about["K"], np.float64).reshape(3, 3)  # of the maps
-        except (KeyError, TypeError, ValueError) as error:
+            if not (0 < self.scale < float("inf") and np.isfinite(self.K).all()):
+                raise ValueError("numbers that cannot be")
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise self._damaged(error) from None
 
     @cached_property
     def _about(self) -> dict[str, Any]:
         content = self._read(_ABOUT)
         try:
-            return dict(json.loads(content))
-        except ValueError as error:
+            return dict(load_json(content.decode()))
+        except (ValueError, TypeError) as error:
             raise self._damaged(error) from None
 
     def depth(self, frame_index: int) -> Float32:
@@ -113,9 +119,11 @@ class DepthReader:
         """
         if frame_index not in self.frames:
             raise InputError(f"{self.path}: has no depth of frame {frame_index}")
-        content = np.frombuffer(self._read(f"{frame_index:06d}.png"), np.uint8)
-        values = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
-        if values is None or values.dtype != np.uint16 or values.ndim != 2:
+        try:
+            values = decode(self._read(f"{frame_index:06d}.png"), cv2.IMREAD_UNCHANGED)
+        except UnreadableFrameError as error:
+            raise self._damaged(f"frame {frame_index}: {error}") from None
+        if values.dtype != np.uint16 or values.ndim != 2:
             raise self._damaged(f"frame {frame_index} is no 16-bit PNG")
         return (values / self.scale).astype(np.float32)
 
@@ -125,8 +133,8 @@ class DepthReader:
                 return file.read(name)
         except FileNotFoundError:
             raise InputError(f"{self.path}: no such file; `improvo run --dense` writes it") from None
-        except (OSError, KeyError, zipfile.BadZipFile) as error:
-            raise self._damaged(error) from None
+        except FAULTS as error:
+            raise self._damaged(reason(error)) from None
 
     def _damaged(self, reason: object) -> InputError:
         return InputError(f"{self.path}: is damaged or not written by improvo ({reason}); run again with --dense")

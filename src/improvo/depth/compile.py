@@ -7,17 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from improvo.depth import agreement_kernels, sweep_kernels
+from improvo.depth import agreement_kernels, refine_kernels, sweep_kernels
 from improvo.depth.agreement import agreed_depth
 from improvo.depth.depth_map import DepthMap
 from improvo.depth.plane_sweep import sweep_prepared
 from improvo.depth.prepared_image import prepare_image
-from improvo.depth.settings import AgreementSettings, SweepSettings
+from improvo.depth.refine import refine_depth
+from improvo.depth.settings import AgreementSettings, RefineSettings, SweepSettings
 
 
 def kernels_are_cached() -> bool:
     """Whether compiled copies are on disk; they may still be stale, which only costs a compilation."""
-    kernels = (sweep_kernels.sweep, sweep_kernels.pick, agreement_kernels.compare)
+    kernels = (sweep_kernels.sweep, sweep_kernels.pick, refine_kernels.measure, agreement_kernels.compare)
     folders = [kernel.stats.cache_path for kernel in kernels]  # None where nothing can be cached
     return all(
         folder is not None and any(Path(folder).glob(f"*{kernel.__name__}-*.nbi"))
@@ -34,4 +35,6 @@ def compile_depth(progress: Callable[[str], None] | None = None) -> None:
     poses[:, 0, 3] = 0.1, -0.1
     K = np.array([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]])
     found = sweep_prepared(image, [image, image], poses, K, (0.5, 4.0), SweepSettings(planes=8))
-    agreed_depth(DepthMap(np.ones_like(found.depth), found.depth, K), [found, found], poses, AgreementSettings())
+    known = DepthMap(np.ones_like(found.depth), np.ones_like(found.depth), K)
+    refine_depth(known, image, [image, image], poses, RefineSettings(steps=1))
+    agreed_depth(known, [known, known], poses, AgreementSettings())

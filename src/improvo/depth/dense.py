@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -11,7 +12,7 @@ import numpy as np
 
 from improvo.depth.archive import DEPTH_FILE, DepthWriter
 from improvo.depth.cloud import DenseCloud, write_cloud
-from improvo.depth.depth_map import half_intrinsics
+from improvo.depth.depth_map import DepthMap, half_intrinsics
 from improvo.depth.depth_maps import depth_maps
 from improvo.depth.settings import DepthSettings
 from improvo.depth.sparse_depths import ranges_of_run
@@ -22,7 +23,7 @@ from improvo.odometry.run import RunSummary
 from improvo.sequences import Sequence
 from improvo.sequences.images import grey
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE
-from improvo.types import Float64, UInt8
+from improvo.types import Float64, Mask, UInt8
 
 CLOUD_FILE = "dense.ply"
 
@@ -74,6 +75,7 @@ def write_dense(
             for frame, depth_map in depth_maps(
                 pictures.grey, cam_from_world, trajectory.segment, camera.K, lambda row: _triple(ranges[row]), settings
             ):
+                depth_map = without_masked(depth_map, pictures.mask(frame))
                 writer.write(frame, depth_map.depth)
                 cloud.add(depth_map, pictures.colour(frame), trajectory.world_from_cam[frame])
                 frames, pixels = frames + 1, pixels + depth_map.depth.size
@@ -103,6 +105,16 @@ def _triple(values: Float64) -> tuple[float, float, float]:
     return near, median, far
 
 
+def without_masked(depth_map: DepthMap, mask: Mask | None) -> DepthMap:
+    """The map without what any masked pixel (H, W) of the frame has a part in."""
+    if mask is None:
+        return depth_map
+    height, width = depth_map.depth.shape
+    four = mask[: 2 * height, : 2 * width].reshape(height, 2, width, 2).all(axis=(1, 3))
+    depth, confidence = (np.where(four, values, np.float32(0)) for values in (depth_map.depth, depth_map.confidence))
+    return replace(depth_map, depth=depth, confidence=confidence)
+
+
 class _Pictures:
     """Frames by frame_index: grey once, in order, and afterwards their colours at half the size."""
 
@@ -118,6 +130,10 @@ class _Pictures:
         cut = colour[: 2 * height, : 2 * width]
         self._colours[frame] = cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA)
         return grey(colour)
+
+    def mask(self, frame: int) -> Mask | None:
+        """Which pixels (H, W) are used; None are all."""
+        return self._sequence.mask(int(self._rows[frame]))
 
     def colour(self, frame: int) -> UInt8:
         """(h, w, 3) BGR of a frame that was read, which is forgotten with this."""

@@ -1,4 +1,4 @@
-"""The depth map of one frame of a sequence with known poses: neighbours, depth range, plane sweep."""
+"""The depth map of one frame of a sequence with known poses: neighbours, depth range, plane sweep, refinement."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from improvo.depth.depth_range import search_depth_range
 from improvo.depth.neighbours import choose_neighbours
 from improvo.depth.plane_sweep import sweep_prepared
 from improvo.depth.prepared_image import PreparedImage, prepare_image
+from improvo.depth.refine import refine_depth
 from improvo.depth.settings import DepthSettings
 from improvo.geometry import se3
 from improvo.types import Float64, UInt8
@@ -71,4 +72,5 @@ def frame_depth(
         return DepthMap.empty(height, width, K), []
     other_from_frame = cam_from_world[rows] @ se3.inverse(cam_from_world[frame])
     others = [prepare(row) for row in rows]
-    return sweep_prepared(reference, others, other_from_frame, K, (near, far), settings.sweep), rows
+    swept = sweep_prepared(reference, others, other_from_frame, K, (near, far), settings.sweep)
+    return refine_depth(swept, reference, others, other_from_frame, settings.refine), rows

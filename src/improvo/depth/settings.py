@@ -53,6 +53,24 @@ class SweepSettings:
 
 
 @dataclass(frozen=True)
+class RefineSettings:
+    """Finer depths on slanted surfaces, after the sweep."""
+
+    steps: int = 3  # 0 leaves the sweep's depths
+    same_surface: float = 0.06  # relative difference of inverse depths within one surface
+    max_step: float = 0.02  # of the inverse depth, relative
+    min_score: float = 0.7  # mean ZNCC over the better half of the neighbours at the end
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.steps <= 20:
+            raise ConfigError(f"refine.steps={self.steps}: is 0 to 20")
+        if not (0 < self.same_surface < 1 and 0 < self.max_step < 1):
+            raise ConfigError(f"refine.same_surface={self.same_surface}, max_step={self.max_step}: are between 0 and 1")
+        if not -1 <= self.min_score < 1:
+            raise ConfigError(f"refine.min_score={self.min_score}: is a correlation, at least -1 and under 1")
+
+
+@dataclass(frozen=True)
 class AgreementSettings:
     """When several frames agree on a depth."""
 
@@ -93,6 +111,7 @@ class DepthSettings:
     reach: int = 60  # frames before and after a frame that may be its neighbours
     neighbours: NeighbourSettings = field(default_factory=NeighbourSettings)
     sweep: SweepSettings = field(default_factory=SweepSettings)
+    refine: RefineSettings = field(default_factory=RefineSettings)
     agreement: AgreementSettings = field(default_factory=AgreementSettings)
     cloud: CloudSettings = field(default_factory=CloudSettings)
 

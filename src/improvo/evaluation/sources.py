@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 from improvo.errors import InputError
 from improvo.frontend import Frontend
+from improvo.frontend.masking import features_of
 from improvo.sequences import Sequence, SequenceSettings
 from improvo.types import Features, Frame, UInt8
 
@@ -104,7 +105,8 @@ class LoadedFrontend:
         Raises:
             MissingExtraError, ConfigError, InputError: the frontend cannot be loaded.
         """
-        return self.of_image(frame.image)
+        loaded = _load(self.name, self.max_keypoints, self.options)
+        return best(features_of(loaded, frame), self.max_keypoints)
 
     def of_image(self, image: UInt8) -> Features:
         """As `features`, of an image (H, W) that is no part of a sequence."""
@@ -152,8 +154,11 @@ def _weights_digest(name: str) -> str | None:
 def sequence_fingerprint(source: SequenceSource, sequence: Sequence) -> dict[str, Any]:
     """All that decides a sequence's frames: its name, length, camera, times, settings, and the first image."""
     settings = getattr(source, "settings", None)
+    mask = None
     try:
-        first = zlib.crc32(sequence[0].image.tobytes())
+        frame = sequence[0]
+        first = zlib.crc32(frame.image.tobytes())
+        mask = None if frame.mask is None else zlib.crc32(frame.mask.tobytes())
     except InputError:  # unreadable: said where its pairs are left out
         first = None
     return {
@@ -162,5 +167,6 @@ def sequence_fingerprint(source: SequenceSource, sequence: Sequence) -> dict[str
         "camera": asdict(sequence.camera),
         "times": zlib.crc32(sequence.times.tobytes()),
         "first_image": first,
+        "first_mask": mask,
         "settings": asdict(settings) if settings is not None else {},
     }

@@ -16,14 +16,14 @@ from improvo.geometry.se3 import quat_xyzw_from_rotation
 from improvo.types import UInt8
 
 
-def write_colmap(model: Model, camera: Camera, folder: Path, grey: UInt8 | None = None) -> None:
+def write_colmap(model: Model, camera: Camera, folder: Path, colours: UInt8 | None = None) -> None:
     """Write `cameras.txt`, `images.txt` and `points3D.txt`.
 
     Args:
         model: the segment.
         camera: pinhole.
         folder: made if need be.
-        grey: (P,) brightness of the points.
+        colours: (P, 3) RGB of the points.
     """
     write_text(folder / "cameras.txt", _camera(camera))
     order = np.lexsort((model.point, model.frame))  # observations by image; the place in the image is POINT2D_IDX
@@ -32,7 +32,7 @@ def write_colmap(model: Model, camera: Camera, folder: Path, grey: UInt8 | None 
     for row in range(len(model.frames)):
         place[order[bounds[row] : bounds[row + 1]]] = np.arange(bounds[row + 1] - bounds[row])
     write_text(folder / "images.txt", _images(model, order, bounds))
-    write_text(folder / "points3D.txt", _points(model, place, grey))
+    write_text(folder / "points3D.txt", _points(model, place, colours))
 
 
 def _camera(camera: Camera) -> str:
@@ -54,16 +54,16 @@ def _images(model: Model, order: np.ndarray, bounds: np.ndarray) -> str:
     return "".join(lines)
 
 
-def _points(model: Model, place: np.ndarray, grey: UInt8 | None) -> str:
+def _points(model: Model, place: np.ndarray, colours: UInt8 | None) -> str:
     lines = ["# POINT3D_ID X Y Z R G B ERROR, then IMAGE_ID POINT2D_IDX of each observation\n"]
     errors = model.point_errors().tolist()
-    shades = (np.full(len(model.xyz), 128) if grey is None else grey).tolist()
+    shades = (np.full((len(model.xyz), 3), 128) if colours is None else colours).tolist()
     bounds = np.searchsorted(model.point, np.arange(len(model.xyz) + 1))
     for number, xyz in enumerate(model.xyz.tolist()):
         rows = slice(bounds[number], bounds[number + 1])
         track = " ".join(
             f"{image + 1} {at}" for image, at in zip(model.frame[rows].tolist(), place[rows].tolist(), strict=True)
         )
-        where, shade = " ".join(repr(value) for value in xyz), shades[number]
-        lines.append(f"{number + 1} {where} {shade} {shade} {shade} {errors[number]!r} {track}\n")
+        where, shade = " ".join(repr(value) for value in xyz), " ".join(map(str, shades[number]))
+        lines.append(f"{number + 1} {where} {shade} {errors[number]!r} {track}\n")
     return "".join(lines)

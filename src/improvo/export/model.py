@@ -103,7 +103,7 @@ def image_name(frame: int) -> str:
 
 
 def write_images(run: RunFolder, model: Model, folder: Path, advance: Callable[[], None] = lambda: None) -> UInt8:
-    """Write the frames, undistorted as the run saw them; returns the grey value (P,) of each point where first seen.
+    """Write the frames, undistorted as the run saw them; returns the RGB (P, 3) of each point where first seen.
 
     Args:
         run: whose recording they come from.
@@ -111,15 +111,15 @@ def write_images(run: RunFolder, model: Model, folder: Path, advance: Callable[[
         folder: made if need be.
         advance: is called after every frame.
     """
-    grey = np.full(len(model.xyz), 128, np.uint8)
+    colours = np.full((len(model.xyz), 3), 128, np.uint8)
     first = np.flatnonzero(np.diff(model.point, prepend=-1))
     pixels = np.rint(model.keypoints[first]).astype(np.int64)
     for row, frame in enumerate(model.frames.tolist()):
-        image = run.image(frame)
-        write_png(folder / image_name(frame), image[..., None].repeat(3, axis=2))
+        image = run.colour(frame)
+        write_png(folder / image_name(frame), image)
         here = np.flatnonzero(model.frame[first] == row)
         v = np.clip(pixels[here, 1], 0, image.shape[0] - 1)
         u = np.clip(pixels[here, 0], 0, image.shape[1] - 1)
-        grey[model.point[first[here]]] = image[v, u]
+        colours[model.point[first[here]]] = image[v, u]
         advance()
-    return grey
+    return colours

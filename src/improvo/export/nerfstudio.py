@@ -16,13 +16,13 @@ _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # y up, looking along -z
 _POINT_CLOUD = "sparse_pc.ply"
 
 
-def write_nerfstudio(model: Model, camera: Camera, folder: Path, grey: UInt8) -> None:
+def write_nerfstudio(model: Model, camera: Camera, folder: Path, colours: UInt8) -> None:
     """Write `transforms.json` and the point cloud into a folder whose `images/` holds the frames.
 
     Nerfstudio counts pixels from the corner of the top-left one, half a pixel before its centre.
     """
     world_from_cam = se3.inverse(model.cam_from_world) @ _OPENGL_FROM_OPENCV
-    _write_point_cloud(model, grey, folder / _POINT_CLOUD)
+    _write_point_cloud(model, colours, folder / _POINT_CLOUD)
     write_json(
         folder / "transforms.json",
         {
@@ -46,16 +46,16 @@ def write_nerfstudio(model: Model, camera: Camera, folder: Path, grey: UInt8) ->
     )
 
 
-def _write_point_cloud(model: Model, grey: UInt8, path: Path) -> None:
+def _write_point_cloud(model: Model, colours: UInt8, path: Path) -> None:
     vertices = np.zeros(
         len(model.xyz), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
     )
     for name, column in zip("xyz", model.xyz.T, strict=True):
         vertices[name] = column
-    for name in ("red", "green", "blue"):
-        vertices[name] = grey
+    for channel, name in enumerate(("red", "green", "blue")):
+        vertices[name] = colours[:, channel]
     kinds = "".join(f"property float {name}\n" for name in "xyz")
-    colours = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{kinds}{colours}end_header\n"
+    shades = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{kinds}{shades}end_header\n"
     with written_atomically(path) as temporary:
         temporary.write_bytes(header.encode() + vertices.tobytes())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from improvo.types import Features, UInt8
+from improvo.types import Features, Mask, UInt8
 
 
 class Frontend(Protocol):
@@ -12,6 +12,9 @@ class Frontend(Protocol):
 
     name: str  # as given to `load_frontend`; goes into run.json
 
-    def __call__(self, image: UInt8) -> Features:
-        """Features of one image (H, W) or (H, W, 3) uint8, best score first; deterministic."""
+    def __call__(self, image: UInt8, mask: Mask | None = None) -> Features:
+        """Features of one image (H, W) or (H, W, 3) uint8, best score first; deterministic.
+
+        Where there is a mask (H, W), all of them are on its True pixels, chosen among those there.
+        """
         ...

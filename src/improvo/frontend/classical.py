@@ -13,10 +13,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from improvo.errors import ConfigError
-from improvo.types import Features, Float32, Int64, UInt8
+from improvo.errors import ConfigError, InputError
+from improvo.frontend.masking import check_mask, unmasked, without_masked
+from improvo.types import Features, Float32, Int64, Mask, UInt8
 
 _opencv: Any = cv2  # its type stubs lack the detectors' constructors
+_SMALLEST_SIDE = 8  # pixels; no detector finds anything in less, and some fail
 _ORB_CANDIDATES = 4  # times max_keypoints; ORB's own choice of the strongest clusters on few structures
 
 
@@ -39,14 +41,18 @@ class ClassicalFrontend:
         self.name = name
         self._max_keypoints = max_keypoints
         self._spread = spread
+        self._sensitive = sensitive
         candidates = max_keypoints * (_ORB_CANDIDATES if spread else 1)
         self._detector = _DETECTORS[name](candidates, sensitive)
 
-    def __call__(self, image: UInt8) -> Features:
-        """Features of one image (H, W) or (H, W, 3) BGR, uint8."""
+    def __call__(self, image: UInt8, mask: Mask | None = None) -> Features:
+        """Features of one image (H, W) or (H, W, 3) BGR, uint8; where there is a mask (H, W), on its True pixels."""
         grey = to_grey(image)
+        check_mask(mask, grey.shape)
+        if min(grey.shape) < _SMALLEST_SIDE:
+            return self._nothing()
         cv2.setRNGSeed(0)  # some detectors sample; the same image must give the same features
-        found = self._detector.detect(grey, None)
+        found = self._detector.detect(grey, None) if mask is None else self._detect_unmasked(grey, mask)
         order, pixels = _best_first(found)
         if self._spread:
             order = order[spread_over_image(pixels[order], grey.shape, self._max_keypoints)]
@@ -60,6 +66,16 @@ class ClassicalFrontend:
         if descriptors.dtype != np.uint8:
             descriptors = unit_rows(descriptors)
         return Features(keypoints, descriptors, scores).take(best_first)
+
+    def _detect_unmasked(self, grey: UInt8, mask: Mask) -> list[Any]:
+        """Keypoints on used pixels; no masked one takes part in a detector's own choice of the best."""
+        # SIFT chooses before it masks, so it is asked for all of them
+        detector = _DETECTORS["sift"](0, self._sensitive) if self.name == "sift" else self._detector
+        found = list(detector.detect(grey, mask.astype(np.uint8)))
+        if not found:
+            return found
+        kept = unmasked(np.asarray(cv2.KeyPoint.convert(found), np.float32).reshape(-1, 2), mask)
+        return [keypoint for keypoint, on in zip(found, kept, strict=True) if on]
 
     def _nothing(self) -> Features:
         binary = self._detector.descriptorType() == cv2.CV_8U
@@ -81,18 +97,20 @@ class SurfFrontend:
         self._threshold = 0.01 if sensitive else 0.1
         self._opencv = _opencv_surf(30.0 if sensitive else 100.0)
 
-    def __call__(self, image: UInt8) -> Features:
-        """Features of one image (H, W) or (H, W, 3) BGR, uint8."""
+    def __call__(self, image: UInt8, mask: Mask | None = None) -> Features:
+        """Features of one image (H, W) or (H, W, 3) BGR, uint8; where there is a mask (H, W), on its True pixels."""
         grey = to_grey(image)
-        rows = self._with_mahotas(grey) if self._opencv is None else self._with_opencv(grey)
+        check_mask(mask, grey.shape)
+        count = self._max_keypoints if mask is None else max(self._max_keypoints, grey.size // 64)  # all there are
+        rows = self._with_mahotas(grey, count) if self._opencv is None else self._with_opencv(grey)
         keypoints, scores, descriptors = rows
-        best_first = np.argsort(-scores, kind="stable")[: self._max_keypoints]
-        return Features(keypoints, unit_rows(descriptors), scores).take(best_first)
+        features = without_masked(Features(keypoints, unit_rows(descriptors), scores), mask)
+        return features.take(np.argsort(-features.scores, kind="stable")[: self._max_keypoints])
 
-    def _with_mahotas(self, grey: UInt8) -> tuple[Float32, Float32, Float32]:
+    def _with_mahotas(self, grey: UInt8, count: int) -> tuple[Float32, Float32, Float32]:
         from mahotas.features import surf
 
-        rows = surf.surf(grey, threshold=self._threshold, max_points=self._max_keypoints)
+        rows = surf.surf(grey, threshold=self._threshold, max_points=count)
         # rows are y, x, scale, score, laplacian, angle, 64 descriptor values
         return rows[:, 1::-1].astype(np.float32), rows[:, 3].astype(np.float32), rows[:, 6:].astype(np.float32)
 
@@ -106,7 +124,15 @@ class SurfFrontend:
 
 
 def to_grey(image: UInt8) -> UInt8:
-    """(H, W) or (H, W, 3) BGR uint8 -> (H, W) uint8."""
+    """(H, W) or (H, W, 3) BGR uint8 -> (H, W) uint8.
+
+    Raises:
+        InputError: an image of another shape or type, or without pixels.
+    """
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3) or 0 in image.shape:
+        raise InputError(f"image of shape {image.shape}: give (H, W) grey or (H, W, 3) colour")
+    if image.dtype != np.uint8:
+        raise InputError(f"image of type {image.dtype}: give uint8")
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 

@@ -11,21 +11,28 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from improvo.frontend.architecture import CELL
+from improvo.frontend.masking import unmasked
 from improvo.frontend.runtime import NetworkMaps
 from improvo.frontend.settings import NetworkSettings
-from improvo.types import Features, Float32, Int64
+from improvo.types import Features, Float32, Int64, Mask
 
 
-def decode(maps: NetworkMaps, row: int, image: Float32, settings: NetworkSettings) -> Features:
+def decode(
+    maps: NetworkMaps, row: int, image: Float32, settings: NetworkSettings, mask: Mask | None = None
+) -> Features:
     """Features of image `row` of the batch, best score first.
 
     Args:
         maps: of images that were padded at the right and the bottom.
         row: position in the batch.
         image: (H, W) grey in [0, 1], before padding; keypoints are found only within.
+        settings: how.
+        mask: (H, W) True where keypoints may be. A masked pixel suppresses none beside it.
     """
     height, width = image.shape
     heat = maps.heat[row, :height, :width]
+    if mask is not None:
+        heat = np.where(mask, heat, np.float32(0))
     pixels = find_keypoints(heat, settings)
     scores = heat[pixels[:, 1], pixels[:, 0]]
     keypoints = (
@@ -37,6 +44,8 @@ def decode(maps: NetworkMaps, row: int, image: Float32, settings: NetworkSetting
         keypoints, found = refine_to_corners(image, keypoints, settings.corner_radius)
         kept = first_at_place(keypoints)
         kept = kept[found[kept]]
+        if mask is not None:
+            kept = kept[unmasked(keypoints[kept], mask)]
         keypoints, scores = keypoints[kept], scores[kept]
     descriptors = sample_descriptors(maps.descriptors[row], keypoints)
     stability = None

@@ -7,6 +7,7 @@ stability head.
 from __future__ import annotations
 
 import warnings
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,9 @@ from improvo.errors import ConfigError, InputError, MissingExtraError
 from improvo.frontend.architecture import Architecture, Normalisation
 from improvo.frontend.weights import ModelCard, Weights
 from improvo.types import Float32, Float64
+from improvo.untrusted.arrays import check_array
+from improvo.untrusted.limits import MAX_WEIGHTS_BYTES
+from improvo.untrusted.text import reason
 
 Tensors = Mapping[str, NDArray[Any]]
 
@@ -32,9 +36,15 @@ class Layout:
     norm_epsilon: float
     names: dict[str, tuple[str, str]]  # our layer -> their convolution and batch norm
 
-    def fits(self, tensors: Tensors) -> bool:
+    def prefixes(self, tensors: Tensors) -> list[str]:
+        """What stands before this layout's names, such as `module.` or `superpoint.`, wherever all of them are."""
+        first = f"{next(iter(self.names.values()))[0]}.weight"
+        found = [name.removesuffix(first) for name in tensors if name == first or name.endswith(f".{first}")]
+        return [prefix for prefix in found if self.fits(tensors, prefix)]
+
+    def fits(self, tensors: Tensors, prefix: str = "") -> bool:
         """Whether all of its convolutions are there."""
-        return all(f"{convolution}.weight" in tensors for convolution, _ in self.names.values())
+        return all(f"{prefix}{convolution}.weight" in tensors for convolution, _ in self.names.values())
 
 
 def _plain(norms: bool) -> dict[str, tuple[str, str]]:
@@ -79,6 +89,7 @@ def read_public_file(path: Path) -> dict[str, NDArray[Any]]:
         if path.suffix == ".safetensors":
             from safetensors.numpy import load_file
 
+            check_array("tensors", (path.stat().st_size,), 1, MAX_WEIGHTS_BYTES)
             return dict(load_file(path))
         try:
             import torch
@@ -86,17 +97,47 @@ def read_public_file(path: Path) -> dict[str, NDArray[Any]]:
             raise MissingExtraError("reading a torch file", "train") from None
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of pickle protocols, when the file is no torch file at all
+            _check_torch_file(path)
             checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except MissingExtraError:
+            return _tensors(path, checkpoint, torch)
+    except (MissingExtraError, InputError):
         raise
     except Exception as error:  # torch and safetensors raise many kinds, from RuntimeError to UnpicklingError
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path}: not readable as a file of tensors ({reason}); save its state_dict alone") from None
-    return {
-        name.removeprefix("module."): values.float().numpy()
-        for name, values in _state_dict(path, checkpoint).items()
-        if isinstance(values, torch.Tensor)
-    }
+        mend = "save its state_dict alone"
+        raise InputError(f"{path}: not readable as a file of tensors ({reason(error)}); {mend}") from None
+
+
+def _check_torch_file(path: Path) -> None:
+    """Refuse a torch file that unpacks to more than it weighs, or is too large.
+
+    Raises:
+        ValueError: it is.
+    """
+    check_array("tensors", (path.stat().st_size,), 1, MAX_WEIGHTS_BYTES)
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            check_array("tensors", (sum(info.file_size for info in archive.infolist()),), 1, MAX_WEIGHTS_BYTES)
+
+
+def _tensors(path: Path, checkpoint: Any, torch: Any) -> dict[str, NDArray[Any]]:
+    """The tensors of a state_dict as float32; those that say they are larger than what is stored are refused.
+
+    Raises:
+        ValueError: they are.
+    """
+    found: dict[str, NDArray[Any]] = {}
+    total = 0
+    for name, values in _state_dict(path, checkpoint).items():
+        if not isinstance(values, torch.Tensor) or not isinstance(name, str):
+            continue
+        if values.layout != torch.strided or values.is_quantized or values.is_complex():
+            raise ValueError(f"`{name}` is no plain tensor")
+        size = check_array(name, values.shape, values.element_size(), MAX_WEIGHTS_BYTES)
+        if size > values.untyped_storage().nbytes():
+            raise ValueError(f"`{name}` says that it has {size} bytes, and has {values.untyped_storage().nbytes()}")
+        total += check_array(name, values.shape, 4, MAX_WEIGHTS_BYTES - total)
+        found[name.removeprefix("module.")] = values.float().numpy()
+    return found
 
 
 def _state_dict(path: Path, checkpoint: Any) -> dict[str, Any]:
@@ -119,10 +160,17 @@ def convert(tensors: Tensors, source: str, licence: str) -> tuple[Weights, Layou
     Raises:
         InputError: none of the three layouts, or tensors missing from it.
     """
-    layout = next((layout for layout in reversed(LAYOUTS) if layout.fits(tensors)), None)
-    if layout is None:
+    fitting = next(((layout, found) for layout in reversed(LAYOUTS) if (found := layout.prefixes(tensors))), None)
+    if fitting is None:
         known = "; ".join(layout.name for layout in LAYOUTS)
         raise InputError(f"{source}: not a SuperPoint layout that is known here ({known}); export it in one of these")
+    layout, prefixes = fitting
+    if len(prefixes) > 1:
+        named = ", ".join(f"`{prefix}`" for prefix in prefixes)
+        raise InputError(f"{source}: holds {len(prefixes)} networks, under {named}; save the one that you mean alone")
+    tensors = {
+        name.removeprefix(prefixes[0]): values for name, values in tensors.items() if name.startswith(prefixes[0])
+    }
     try:
         ours: dict[str, Float32] = {}
         for layer, (convolution, norm) in layout.names.items():

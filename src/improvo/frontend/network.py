@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from improvo.errors import InputError
 from improvo.frontend.architecture import CELL
 from improvo.frontend.decoding import decode, stability_map
+from improvo.frontend.masking import check_mask
 from improvo.frontend.runtime import Runtime, open_runtime
 from improvo.frontend.settings import NetworkSettings
 from improvo.frontend.weights import Weights, find_weights, load_weights
-from improvo.types import Features, Float32
+from improvo.types import Features, Float32, Mask
 
 Image = NDArray[Any]  # (H, W) or (H, W, 3) blue-green-red; uint8, or float in [0, 1]
 
@@ -40,7 +41,7 @@ class NetworkFrontend:
     """SuperPoint with a stability head behind the `Frontend` interface.
 
     Images may have any size and be grey or colour (blue-green-red, as OpenCV reads them), uint8 or float in [0, 1].
-    Not to be called from several threads at once.
+    Several threads may call it.
     """
 
     def __init__(self, weights: Weights, settings: NetworkSettings | None = None, name: str = "") -> None:
@@ -54,25 +55,31 @@ class NetworkFrontend:
         """What runs the network."""
         return self._runtime
 
-    def __call__(self, image: Image) -> Features:
-        """Features of one image, best score first.
+    def __call__(self, image: Image, mask: Mask | None = None) -> Features:
+        """Features of one image, best score first; where there is a mask (H, W), on its True pixels.
 
         Raises:
-            InputError: an image of another shape or type, or with values that are not finite.
+            InputError: an image of another shape or type, with values that are not finite, or a mask of another size.
         """
-        return self.batch([image])[0]
+        return self.batch([image], None if mask is None else [mask])[0]
 
-    def batch(self, images: Sequence[Image]) -> list[Features]:
+    def batch(self, images: Sequence[Image], masks: Sequence[Mask | None] | None = None) -> list[Features]:
         """Features of images of one size, in one pass of the network; memory grows with their number."""
         if not images:
             return []
         sizes = {image.shape[:2] for image in images}
         if len(sizes) > 1:
             raise InputError(f"a batch needs images of one size, these have {sorted(sizes)}; pass them one by one")
+        chosen = list(masks) if masks is not None else [None] * len(images)
+        for mask in chosen:
+            check_mask(mask, images[0].shape)
         prepared = _prepared(images)
         maps = self._runtime(prepared)
         height, width = images[0].shape[:2]
-        return [decode(maps, row, grey[0, :height, :width], self.settings) for row, grey in enumerate(prepared)]
+        return [
+            decode(maps, row, grey[0, :height, :width], self.settings, mask)
+            for row, (grey, mask) in enumerate(zip(prepared, chosen, strict=True))
+        ]
 
     def heat_map(self, image: Image) -> Float32:
         """Probability (H, W) that a pixel is a keypoint, before non-maximum suppression."""

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import numpy as np
-import openvino as ov
-from openvino import opset13 as ops
 
 from improvo.frontend.architecture import CELL, POOL_AFTER
+from improvo.frontend.openvino_library import openvino as ov
+from improvo.frontend.openvino_library import opset13 as ops
 from improvo.frontend.runtime import NetworkMaps
 from improvo.frontend.weights import Weights
 from improvo.types import Float32
 
+_KEPT_SIZES = 4
 INT8_MAX = 127
 INT8_IMAGE_COPIES = 4
 INT8_LAST_LAYERS = ("descriptor.1",)  # of the 1×1 convolutions; rounding the detector's moves keypoints
@@ -27,7 +29,8 @@ class OpenVinoRuntime:
             ranges of the model card.
         threads: 0 for as many as the machine has.
 
-    One graph is compiled for each image size and kept. Not to be called from several threads at once.
+    A graph is compiled for each image size; those of the last few sizes are kept. Each thread has its own request, so
+    that several may call it; what it returns holds until the same thread calls it again.
     """
 
     def __init__(self, weights: Weights, int8: bool = False, threads: int = 0) -> None:
@@ -38,16 +41,34 @@ class OpenVinoRuntime:
         if threads:
             self._options["INFERENCE_NUM_THREADS"] = threads
         self._core = ov.Core()
-        self._requests: dict[tuple[int, ...], Any] = {}
+        self._compiled: dict[tuple[int, ...], Any] = {}
+        self._compiling = threading.Lock()
+        self._own = threading.local()  # `requests`: by image size, of one thread
 
     def __call__(self, images: Float32) -> NetworkMaps:
         """Maps of (B, 1, H, W) images in [0, 1] with sides that are multiples of 8."""
-        request = self._requests.get(images.shape)
+        requests: dict[tuple[int, ...], Any] = self._own.__dict__.setdefault("requests", {})
+        request = requests.get(images.shape)
         if request is None:
-            compiled = self._core.compile_model(self._graph.model(images.shape), "CPU", self._options)
-            request = self._requests[images.shape] = compiled.create_infer_request()
+            request = _kept(requests, images.shape, self._compiled_for(images.shape).create_infer_request())
         maps = request.infer([images], share_inputs=True, share_outputs=True)
         return NetworkMaps(maps[0][:, 0], maps[1], maps[2] if len(maps) > 2 else None)
+
+    def _compiled_for(self, shape: tuple[int, ...]) -> Any:
+        with self._compiling:
+            found = self._compiled.get(shape)
+            if found is None:
+                compiled = self._core.compile_model(self._graph.model(shape), "CPU", self._options)
+                found = _kept(self._compiled, shape, compiled)
+            return found
+
+
+def _kept(cache: dict[tuple[int, ...], Any], shape: tuple[int, ...], value: Any) -> Any:
+    """The value, kept by its size; the oldest makes room."""
+    while len(cache) >= _KEPT_SIZES:
+        cache.pop(next(iter(cache)), None)
+    cache[shape] = value
+    return value
 
 
 def activation_ranges(weights: Weights, images: Float32, quantile: float) -> dict[str, float]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from improvo.errors import ConfigError
 from improvo.frontend import Frontend
-from improvo.types import Features
+from improvo.types import Features, Mask
 
 
 class StableOnly:
@@ -26,13 +26,13 @@ class StableOnly:
         self.frontend, self.least = frontend, least
         self.name = frontend.name
 
-    def __call__(self, image: NDArray[Any]) -> Features:
-        """Features of an image, best first.
+    def __call__(self, image: NDArray[Any], mask: Mask | None = None) -> Features:
+        """Features of an image, best first; where there is a mask, on its True pixels.
 
         Raises:
             ConfigError: the frontend has no stability head.
         """
-        features = self.frontend(image)
+        features = self.frontend(image) if mask is None else self.frontend(image, mask)
         if features.stability is None:
             raise ConfigError(
                 f"frontend {self.name}: has no stability head, so least_stability must be 0; superpoint-vo has one"

@@ -15,6 +15,9 @@ from improvo import config, files
 from improvo.errors import ConfigError, InputError
 from improvo.frontend.architecture import Architecture, Convolution
 from improvo.types import Float32
+from improvo.untrusted.arrays import check_array
+from improvo.untrusted.limits import MAX_WEIGHTS_BYTES
+from improvo.untrusted.text import load_json, reason
 
 BUNDLED = Path(__file__).parent / "weights"
 HEADER_KEY = "improvo_model_card"
@@ -134,17 +137,18 @@ def load_weights(path: Path) -> Weights:
     if not path.is_file():
         raise InputError(f"{path}: no such weights file; bundled: {', '.join(bundled_names()) or 'none'}")
     try:
+        check_array("tensors", (path.stat().st_size,), 1, MAX_WEIGHTS_BYTES)
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
             header = metadata.get(HEADER_KEY) or metadata.get(f"{files.FORMER_NAME}_model_card")
             tensors = {name: np.asarray(file.get_tensor(name), np.float32) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError, TypeError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path}: not a safetensors file, or truncated ({reason}); fetch or export it again") from None
+    except (SafetensorError, OSError, ValueError, TypeError, MemoryError, AttributeError) as error:
+        words = f"not a safetensors file, or truncated ({reason(error)})"
+        raise InputError(f"{path}: {words}; fetch or export it again") from None
     if header is None:
         raise InputError(f"{path}: safetensors without an improvo model card; convert it with `improvo weights import`")
     try:
-        card = config.from_dict(ModelCard, json.loads(header), where="model card")
+        card = config.from_dict(ModelCard, load_json(header), where="model card")
     except (ValueError, ConfigError) as error:
         raise InputError(f"{path}: not readable, {error}; was it made by another version of improvo?") from None
     _check_tensors(path, tensors, card.architecture)

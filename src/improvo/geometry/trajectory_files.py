@@ -8,6 +8,8 @@ orthonormal only to about 3e-4, which would show as degrees of rotation error.
 from __future__ import annotations
 
 import re
+from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +17,13 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.files import write_text
 from improvo.geometry.se3 import quat_xyzw_from_rotation, rigid, rotation_from_quat_xyzw
+from improvo.geometry.text_files import read_text
+from improvo.geometry.time_units import in_seconds
 from improvo.types import Float64, Int64, Trajectory
 
 RIGID_TOLERANCE = 1e-2
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
+_DATE = re.compile(r"\d{4}-\d\d-\d\d")
 _TUM_HEADER = "# camera-to-world, up to scale: timestamp tx ty tz qx qy qz qw\n"
 _SEGMENT_COMMENT = re.compile(r"#\s*segment\s+(\d+)\s*(?::|$)")
 
@@ -44,13 +50,7 @@ def read_trajectory_report(
         InputError: not such a file, or no row with a pose.
     """
     path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise InputError(
-            f"{path}: cannot be read as a trajectory ({reason}); give a TUM, KITTI or EuRoC file"
-        ) from None
+    lines = read_text(path, "a trajectory", "give a TUM, KITTI or EuRoC file").splitlines()
     format = _guess(lines, path) if format == "auto" else format
     columns = {"tum": 8, "kitti": 12, "euroc": 8}.get(format)
     if columns is None:
@@ -61,13 +61,16 @@ def read_trajectory_report(
         raise InputError(f"{path}: has no row of {columns} numbers, so it is no {format.upper()} trajectory")
     if format == "kitti":
         matrices = np.concatenate([values.reshape(-1, 3, 4), np.tile([[[0.0, 0, 0, 1]]], (len(values), 1, 1))], axis=1)
-        stamps = _kitti_times(path, len(values)) if times is None else np.asarray(times, np.float64)
+        stamps, assumed = (np.asarray(times, np.float64), ()) if times is not None else _kitti_times(path, len(values))
+        problems += assumed
         if len(stamps) < len(values):
             raise InputError(f"{path}: has {len(values)} poses but there are {len(stamps)} times; remove what is extra")
         stamps = stamps[: len(values)]
     else:
-        stamps = values[:, 0] * (1e-9 if format == "euroc" else 1.0)
-        quat_xyzw = values[:, [5, 6, 7, 4]] if format == "euroc" else values[:, 4:8]
+        stamps, unit = (values[:, 0] * 1e-9, None) if format == "euroc" else in_seconds(values[:, 0])
+        problems += (f"time stamps are taken as {unit}, by their size",) if unit else ()
+        w_first = (_quaternion_order(lines) or ("wxyz" if format == "euroc" else "xyzw")) == "wxyz"
+        quat_xyzw = values[:, [5, 6, 7, 4]] if w_first else values[:, 4:8]
         matrices = _from_quaternions(quat_xyzw, values[:, 1:4])
     poses, not_finite, not_rigid = clean_poses(matrices)
     problems += _named("NaN or infinite", line_numbers[not_finite], "line")
@@ -171,7 +174,7 @@ def _rows(lines: list[str], columns: int) -> tuple[Float64, Int64, Int64, Int64]
             match = _SEGMENT_COMMENT.match(text)
             segment = int(match.group(1)[:9]) if match else segment
             continue
-        fields = text.replace(",", " ").split()
+        fields = split_numbers(text)
         if not fields:
             continue
         try:
@@ -179,7 +182,8 @@ def _rows(lines: list[str], columns: int) -> tuple[Float64, Int64, Int64, Int64]
         except ValueError:
             row = []
         if len(row) < columns:
-            malformed.append(number)
+            if values or malformed or any(_is_number(field) for field in fields):  # else the names of the columns
+                malformed.append(number)
             continue
         values.append(row)
         numbers.append(number)
@@ -188,12 +192,23 @@ def _rows(lines: list[str], columns: int) -> tuple[Float64, Int64, Int64, Int64]
     return np.asarray(values, np.float64).reshape(-1, columns), as_int[0], as_int[1], as_int[2]
 
 
+def split_numbers(text: str) -> list[str]:
+    """The fields of a row, separated by spaces, commas or semicolons; a decimal comma becomes a point.
+
+    A comma is a decimal one where the fields are separated otherwise, and each has at most one between its digits.
+    """
+    parts = text.replace(";", " ").split()
+    if len(parts) > 1 and any("," in part for part in parts) and all(_DECIMAL_COMMA.fullmatch(part) for part in parts):
+        return [part.replace(",", ".") for part in parts]
+    return text.replace(",", " ").replace(";", " ").split()
+
+
 def _guess(lines: list[str], path: Path) -> str:
     for line in lines:
         text = line.strip()
-        if not text or text.startswith("#"):
+        fields = split_numbers(text)
+        if not fields or text.startswith("#") or not _is_number(fields[0]):
             continue
-        fields = text.replace(",", " ").split()
         if len(fields) == 12:
             return "kitti"
         # EuRoC: nanoseconds, commas, and further columns after the quaternion
@@ -203,6 +218,27 @@ def _guess(lines: list[str], path: Path) -> str:
             return "tum"
         break
     raise InputError(f"{path}: is no trajectory; a row has 8 numbers (TUM, EuRoC) or 12 (KITTI)")
+
+
+def _quaternion_order(lines: list[str]) -> str | None:
+    """`wxyz` or `xyzw` as the names of the columns say it; None where they say nothing."""
+    for line in lines:
+        fields = [field for field in re.split(r"[\s,;#]+", line.lower()) if field and not field.startswith("[")]
+        if fields and _is_number(fields[0]):
+            return None
+        matches = [re.fullmatch(r"(?:q|quat|rot|orientation)\w*?([wxyz])(?:\[\])?", field) for field in fields]
+        order = "".join(match.group(1) for match in matches if match is not None)
+        if order in ("wxyz", "xyzw"):
+            return order
+    return None
+
+
+def _is_number(field: str) -> bool:
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
 
 
 def _from_quaternions(quat_xyzw: Float64, translation: Float64) -> Float64:
@@ -217,30 +253,68 @@ def _from_quaternions(quat_xyzw: Float64, translation: Float64) -> Float64:
     return rigid(rotation, translation)
 
 
-def _kitti_times(path: Path, count: int) -> Float64:
-    """Times of KITTI poses: `times.txt` beside them if it fits, else 10 Hz, KITTI's rate."""
+def has_times(path: Path) -> bool:
+    """Whether the rows of a trajectory file have times: KITTI's have none, unless a `times.txt` beside it fits."""
+    lines = read_text(path, "a trajectory", "give a TUM, KITTI or EuRoC file").splitlines()
+    if _guess(lines, path) != "kitti":
+        return True
+    return not _kitti_times(path, len(_rows(lines, 12)[0]))[1]
+
+
+def _kitti_times(path: Path, count: int) -> tuple[Float64, tuple[str, ...]]:
+    """Times of KITTI poses: `times.txt` beside them if it fits, else 10 Hz, KITTI's rate, and a note."""
     beside = path.with_name("times.txt")
     if beside.is_file():
-        times = read_times(beside)
+        times = read_times(beside)[0]
         if len(times) >= count:
-            return times[:count]
-    return np.arange(count) / 10.0
+            return times[:count], ()
+    return np.arange(count) / 10.0, ("has no times; 10 poses per second assumed, as in KITTI",)
 
 
-def read_times(path: Path) -> Float64:
-    """Seconds, one a line.
+def read_times(path: Path) -> tuple[Float64, tuple[str, ...]]:
+    """Seconds, one a line, and a note where they were written in another unit.
+
+    A line is a time, or `number time exposure` (DSO, TUM mono), or `time file`, or a date and a clock time (KITTI raw).
 
     Raises:
-        InputError: a line that is no number.
+        InputError: a line that is none of these.
     """
+    mend = "it must hold one time in seconds per line; repair or remove it"
+    lines = read_text(path, "times", mend).splitlines()
+    lines = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    rows = [split_numbers(line) for line in lines]
+    if all(re.fullmatch(r"\d+,\d+", line) for line in lines) and not _counts(rows):
+        whole = [float(row[0]) for row in rows]
+        if any(b <= a for a, b in pairwise(whole)):  # decimal commas: alone, the part before them does not increase
+            rows = [[line.replace(",", ".")] for line in lines]
+    if rows and not _is_number(rows[0][0]) and not _DATE.match(rows[0][0]):
+        rows = rows[1:]  # the names of the columns
     try:
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-        times = np.array([float(line.split()[0]) for line in lines if not line.lstrip().startswith("#")], np.float64)
-    except (OSError, UnicodeDecodeError, ValueError) as error:
+        if rows and all(len(row) > 1 and _DATE.fullmatch(row[0]) for row in rows):
+            stamps = np.array([_time_of_day(*row[:2]) for row in rows], np.float64)
+        else:
+            column = 1 if _counts(rows) else 0
+            stamps = np.array([float(row[column]) for row in rows], np.float64)
+    except ValueError as error:
         raise InputError(f"{path}: must hold one time in seconds per line ({error}); repair or remove it") from None
-    if not np.isfinite(times).all():
+    if not np.isfinite(stamps).all():
         raise InputError(f"{path}: holds a time that is not finite; repair or remove it")
-    return times
+    seconds, unit = in_seconds(stamps)
+    return seconds, ((f"{path}: time stamps are taken as {unit}, by their size",) if unit else ())
+
+
+def _counts(rows: list[list[str]]) -> bool:
+    """Whether the first column only numbers the rows, and the second has the times."""
+    if len(rows) < 2 or not all(len(row) > 1 and row[0].isdigit() and _is_number(row[1]) for row in rows):
+        return False
+    numbers, second = (np.array([float(row[column]) for row in rows]) for column in (0, 1))
+    return bool((np.diff(numbers) == 1).all() and (np.diff(second) > 0).all())
+
+
+def _time_of_day(date: str, clock: str) -> float:
+    """Seconds since 1970 of `2011-09-26 13:02:25.964389445`."""
+    whole, _, fraction = clock.partition(".")
+    return datetime.fromisoformat(f"{date}T{whole}+00:00").timestamp() + float(f"0.{fraction or 0}")
 
 
 def _named(what: str, rows: Int64, unit: str) -> tuple[str, ...]:

@@ -161,7 +161,7 @@ class ImproveFolder:
         make_output_folder(self.folder, COMMAND)
         record.write(values)
         for leftover in list(self.folder.rglob(".*.partial*")):  # of a killed run; some lie in others
-            if leftover.is_dir():
+            if leftover.is_dir() and not leftover.is_symlink():
                 shutil.rmtree(leftover, ignore_errors=True)
             else:
                 leftover.unlink(missing_ok=True)

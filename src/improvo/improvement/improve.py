@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from improvo.files import make_output_folder
+from improvo.folder_lock import locked
 from improvo.frontend.weights import load_weights, save_weights
 from improvo.improvement.estimate import refuse_full_disk
-from improvo.improvement.folder import Candidate, ImproveFolder
+from improvo.improvement.folder import COMMAND, Candidate, ImproveFolder
 from improvo.improvement.progress import ImprovementProgress
 from improvo.improvement.recipe import Train, TrainingJob
 from improvo.improvement.reference import ReferencePart
@@ -69,44 +71,45 @@ def improve(
     Raises:
         InputError: nothing could be labelled, or weights that cannot be read.
         ConfigError: the folder was begun with other settings.
-        OutputError: the folder is not ours, or cannot be written (full disk).
+        OutputError: the folder is not ours, another process is at work there, or it cannot be written (full disk).
     """
     progress = progress or ImprovementProgress()
     first_weights = starting_weights(settings.frontend.name)
-    folder = ImproveFolder(output, sequences, evaluate, settings, first_weights)
-    loop = Rounds(folder, settings, train or _train, data, workers, ray, progress)
-
-    split = loop.split(sequences, evaluate, first_weights)
-    progress.split(split)
-    start = loop.start(first_weights, split.training)
-    needed = loop.estimate(start, split, rounds)
-    progress.line(f"estimate: {needed.words}")
-    refuse_full_disk(output, needed)
-    teaching, judging = loop.reference(split)
-    result = Improvement(folder.weights, 0, (start,), (loop.validate(start, split.held_back, judging),))
-    progress.validated(start, result.validations[0], result.validations[0], settings.validation)
-    _keep(result, folder, split, settings)
-    for number in range(1, max(rounds, folder.finished_rounds()) + 1):
-        teacher = result.candidates[result.best]
-        candidate = folder.round(number)
-        if not candidate.validation.is_file():
-            loop.label(teacher, split.training)
-            loop.train(candidate, number, teacher, split.training, teaching)
-        validation = loop.validate(candidate, split.held_back, judging)
-        better = is_better(validation, result.validations[result.best], settings.validation)
-        progress.validated(candidate, validation, result.validations[0], settings.validation, better)
-        result = replace(
-            result,
-            best=number if better else result.best,
-            candidates=(*result.candidates, candidate),
-            validations=(*result.validations, validation),
-        )
-        if number == 1 and settings.control:
-            control = _control(loop, folder, result, split, (teaching, judging))
-            progress.validated(*control, result.validations[0], settings.validation)
-            result = replace(result, control=control)
+    make_output_folder(output, COMMAND)
+    with locked(output):
+        folder = ImproveFolder(output, sequences, evaluate, settings, first_weights)
+        loop = Rounds(folder, settings, train or _train, data, workers, ray, progress)
+        split = loop.split(sequences, evaluate, first_weights)
+        progress.split(split)
+        start = loop.start(first_weights, split.training)
+        needed = loop.estimate(start, split, rounds)
+        progress.line(f"estimate: {needed.words}")
+        refuse_full_disk(output, needed)
+        teaching, judging = loop.reference(split)
+        result = Improvement(folder.weights, 0, (start,), (loop.validate(start, split.held_back, judging),))
+        progress.validated(start, result.validations[0], result.validations[0], settings.validation)
         _keep(result, folder, split, settings)
-    return result
+        for number in range(1, max(rounds, folder.finished_rounds()) + 1):
+            teacher = result.candidates[result.best]
+            candidate = folder.round(number)
+            if not candidate.validation.is_file():
+                loop.label(teacher, split.training)
+                loop.train(candidate, number, teacher, split.training, teaching)
+            validation = loop.validate(candidate, split.held_back, judging)
+            better = is_better(validation, result.validations[result.best], settings.validation)
+            progress.validated(candidate, validation, result.validations[0], settings.validation, better)
+            result = replace(
+                result,
+                best=number if better else result.best,
+                candidates=(*result.candidates, candidate),
+                validations=(*result.validations, validation),
+            )
+            if number == 1 and settings.control:
+                control = _control(loop, folder, result, split, (teaching, judging))
+                progress.validated(*control, result.validations[0], settings.validation)
+                result = replace(result, control=control)
+            _keep(result, folder, split, settings)
+        return result
 
 
 def _control(

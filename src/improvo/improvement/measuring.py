@@ -100,7 +100,7 @@ def _scores(
 
     @cache
     def features(frame: int) -> Features:
-        return frontend(reference.image(frame))
+        return reference.features(frontend, frame)
 
     found = []
     for level, pairs in enumerate(pairs_of(run, settings)):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from improvo.frontend.weights import DataSource
     from improvo.training.posed import PosedSequence
 
-_STEPS_PER_FRAME, _FEWEST, _MOST = 3, 300, 1200  # the most take a quarter of an hour on two calm cores
+_FEWEST = 300  # steps, however short the training part is
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,8 @@ def steps_of(settings: ImproveSettings, frames: int) -> int:
     """
     if settings.recipe != HELD:
         return settings.training.optimiser.steps
-    return settings.held.optimiser.steps or int(np.clip(_STEPS_PER_FRAME * frames, _FEWEST, _MOST))
+    most = settings.held.optimiser.steps
+    return min(max(round(settings.steps_per_frame * frames), _FEWEST), most) if settings.steps_per_frame else most
 
 
 def _train_held(job: TrainingJob) -> dict[str, Any]:

@@ -14,11 +14,13 @@ import cv2
 import numpy as np
 
 from improvo.depth.archive import DepthReader, DepthWriter
+from improvo.depth.dense import without_masked
 from improvo.depth.depth_map import half_intrinsics
 from improvo.depth.depth_maps import depth_maps
 from improvo.depth.sparse_depths import ranges_of_run
 from improvo.errors import InputError
 from improvo.evaluation.pose.self_truth import FixedRun
+from improvo.frontend import Frontend
 from improvo.geometry import se3
 from improvo.improvement.settings import ReferenceSettings
 from improvo.improvement.split import Part
@@ -26,7 +28,7 @@ from improvo.labeling.labeled import LabeledSequence, read_labels
 from improvo.sequences import open_sequence
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE
 from improvo.training.posed import PosedSequence
-from improvo.types import Float32, Float64, Int64, UInt8
+from improvo.types import Features, Float32, Float64, Int64, UInt8
 
 TRAINING, HELD_BACK = "training", "held-back"
 
@@ -51,9 +53,10 @@ class ReferencePart:
         has_depth[reader.frames] = True
         return FixedRun(self.labeled.camera, world_from_cam, segment, has_depth, reader.depth)
 
-    def image(self, frame: int) -> UInt8:
-        """The grey image (H, W) of a frame."""
-        return self.labeled.image(frame)
+    def features(self, frontend: Frontend, frame: int) -> Features:
+        """Of a frame, none of them on a masked pixel."""
+        image, mask = self.labeled.image(frame), self.labeled.mask(frame)
+        return frontend(image) if mask is None else frontend(image, mask)
 
     def teaching_frames(self, longer_side: int) -> list[PosedSequence]:
         """Pictures, poses and depth of the frames with a depth map, segment by segment.
@@ -73,7 +76,7 @@ class ReferencePart:
             own = frames[run.segment[frames] == number]
             if len(own) < 2:
                 continue
-            pictures = tuple(_reduced(self.image(int(frame)), size) for frame in own)
+            pictures = tuple(_reduced(self.labeled.image(int(frame)), size) for frame in own)
             depths = tuple(_inverse(reader.depth(int(frame))) for frame in own)
             times = self.labeled.frames.time[own]
             found.append(PosedSequence(self.name, pictures, times, K, run.world_from_cam[own], depths))
@@ -125,8 +128,9 @@ def make_depth(
         for frame, found in depth_maps(
             labeled.image, seen, segment, K, lambda row: _triple(ranges[row]), settings.depth
         ):
-            if found.known >= settings.least_known:
-                writer.write(frame, found.depth)
+            unmasked = without_masked(found, labeled.mask(frame))
+            if unmasked.known >= settings.least_known:
+                writer.write(frame, unmasked.depth)
             tick()
 
 

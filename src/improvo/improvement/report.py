@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from improvo.improvement.validation import Validation, gain, loose, rule, strict
 from improvo.labeling.store import DONE, read_records
 from improvo.report.improvement_page import Measure, Round, write_improvement_page
 from improvo.sequences import open_sequence
+from improvo.training.metrics import METRICS, read_metrics
 
 _LOSSES = ("loss", "detector", "descriptor", "stability")
 _PANEL = 400  # pixels, width of each of the three panels of matches
@@ -107,10 +107,7 @@ def _share_name(limit: float, gap: str = "") -> str:
 
 def _training_losses(folder: Path) -> dict[str, list[float]]:
     """The rows of `metrics.jsonl`, by column; empty where nothing was trained."""
-    try:
-        rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    except FileNotFoundError:
-        return {}
+    rows = read_metrics(folder / METRICS)
     names = [name for name in rows[0] if all(name in row for row in rows)] if rows else []
     return {name: [float(row[name]) for row in rows] for name in names}
 
@@ -243,8 +240,9 @@ def _draw_matches(
     sequence = open_sequence(part.paths[0], part.sequence)
     gap = min(validation.scores[0].gap, len(sequence) - 1)
     a = (len(sequence) - gap) // 2
-    b = a + gap
-    picture = paint_matches(frontend, sequence[a].image, sequence[b].image, None, sequence.camera, width=_PANEL)
+    first, second = sequence[a], sequence[a + gap]
+    masks = first.mask, second.mask
+    picture = paint_matches(frontend, first.image, second.image, None, sequence.camera, width=_PANEL, masks=masks)
     write_png(target, picture)
 
 
@@ -256,8 +254,8 @@ def _draw_stability(
 
     frontend = load_network_frontend(candidate.weights, max_keypoints=settings.frontend.max_keypoints)
     sequence = open_sequence(part.paths[0], part.sequence)
-    image = sequence[len(sequence) // 2].image
-    write_png(target, paint_stability(image, frontend, candidate.name, width=_SINGLE))
+    frame = sequence[len(sequence) // 2]
+    write_png(target, paint_stability(frame.image, frontend, candidate.name, width=_SINGLE, mask=frame.mask))
 
 
 def _draw_labels(

@@ -90,13 +90,14 @@ class ImproveSettings:
     # held: descriptors from dense pairs and tracks, the other heads held to the start's. tracks: all heads from tracks
     recipe: str = HELD
     control: bool = False  # also train, from the same start, by homographies of the same frames alone, and show it
-    minutes: float = 0.0  # that training may take in each round; 0: as many steps as the optimiser's settings say
+    minutes: float = 0.0  # that training may take in each round; 0: as many steps as the following say
+    # for each frame of the training part, at least 300 in all and at most `held.optimiser.steps`; 0: exactly those
+    steps_per_frame: float = 3.0
     held: HeldSettings = field(
         default_factory=lambda: HeldSettings(
             pairs=DevicePairSettings(group=1),
-            # steps 0: three for each frame of the training part, within 300 and 1200
-            optimiser=OptimiserSettings(
-                steps=0, batch_size=2, learning_rate=5e-4, decay_steps=400, warmup_steps=50, workers=0
+            optimiser=OptimiserSettings(  # 1200 steps take a quarter of an hour on two calm cores
+                steps=1200, batch_size=2, learning_rate=5e-4, decay_steps=400, warmup_steps=50, workers=0
             ),
         )
     )
@@ -110,8 +111,9 @@ class ImproveSettings:
     def __post_init__(self) -> None:
         if self.recipe not in RECIPES:
             raise ConfigError(f"recipe `{self.recipe}`: unknown; choose {' or '.join(RECIPES)}")
-        if self.minutes < 0:
-            raise ConfigError(f"minutes={self.minutes:g}: must be 0 or more")
+        for name in ("minutes", "steps_per_frame"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise ConfigError(f"{name}={getattr(self, name):g}: must be 0 or more")
         if self.minutes and self.recipe != HELD:
             raise ConfigError("minutes: only the recipe `held` chooses its steps by time; give steps instead")
 

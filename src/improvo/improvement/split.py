@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Callable, Sequence
@@ -10,10 +9,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from improvo import config
-from improvo.errors import InputError
+from improvo.errors import ConfigError, InputError
 from improvo.files import MARKER, write_json
 from improvo.labeling.store import DONE, RECORD_FILE, SETTINGS_FILE, SequenceRecord, sequence_names
 from improvo.sequences import SequenceSettings, open_sequence
+from improvo.untrusted.text import read_json_file
 
 _MIN_FRAMES = 3  # of each part
 
@@ -103,10 +103,14 @@ def split_whole_sequences(records: Sequence[SequenceRecord], sequence: SequenceS
 def remembered_split(path: Path, choose: Callable[[], Split]) -> Split:
     """The split that `path` remembers from an earlier run, else the one that `choose` makes."""
     if path.is_file():
+        mend = "remove the folder and begin again"
         try:
-            return config.from_dict(Split, json.loads(path.read_text()), where=str(path))
-        except ValueError:
-            raise InputError(f"{path}: is damaged; remove the folder and begin again") from None
+            split = config.from_dict(Split, read_json_file(path, mend), where=str(path))
+        except ConfigError as error:
+            raise InputError(f"{error}: is damaged; {mend}") from None
+        if not split.training.paths or not split.held_back.paths:
+            raise InputError(f"{path}: is damaged; {mend}")
+        return split
     split = choose()
     values = config.to_dict(split)
     for part in ("training", "held_back"):

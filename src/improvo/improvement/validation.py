@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from improvo.errors import InputError
+from improvo import config
+from improvo.errors import ConfigError, InputError
 from improvo.evaluation.pose.self_truth import PairScores, SelfTruthSettings, compare_gaps
 from improvo.files import write_json
 from improvo.improvement.settings import ValidationSettings
+from improvo.untrusted.text import read_json_file
 
 
 @dataclass(frozen=True)
@@ -170,13 +170,29 @@ def read_validation(path: Path) -> Validation:
     Raises:
         InputError: it is damaged.
     """
+    mend = "remove it, and it is measured again"
+    values = read_json_file(path, mend)
+    error = values.get("error", 0.0)
     try:
-        values: dict[str, Any] = json.loads(path.read_text())
-        error = float("nan") if values["error"] is None else values["error"]
-        scores = tuple(GapScores(**entry) for entry in values["scores"])
-        return Validation(**{**values, "error": error, "failures": tuple(values["failures"]), "scores": scores})
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: is damaged; remove it, and it is measured again") from None
+        found = config.from_dict(Validation, {**values, "error": float("nan") if error is None else error})
+        if not (_belongs_together(found) and {"label", "evaluate"} <= found.seconds.keys()):
+            raise ConfigError("values that do not belong together")
+    except ConfigError:
+        raise InputError(f"{path}: is damaged; {mend}") from None
+    return found
+
+
+def _belongs_together(found: Validation) -> bool:
+    """Whether the numbers are finite, and every pair has its values."""
+    numbers = [found.track_length, found.stable_share, *found.truth.values()]
+    for scores in found.scores:
+        columns = list(scores.values.values())
+        numbers += [scores.seconds, *(value for column in columns for value in column)]
+        lengths = {len(scores.pairs), len(scores.matches), *map(len, columns)}
+        named = scores.values.keys() == found.scores[0].values.keys()
+        if len(lengths) > 1 or not scores.pairs or not named or any(len(pair) != 2 for pair in scores.pairs):
+            return False
+    return bool(found.scores) and bool(np.isfinite(numbers).all())
 
 
 def _only(scores: PairScores, name: str) -> PairScores:

@@ -128,7 +128,7 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
     write_frames(job.folder / FRAMES_FILE, frames)
     if job.pack:
         try:
-            pack_images(job.folder, (frame.image for frame in sequence))
+            pack_images(job.folder, ((frame.image, frame.mask) for frame in sequence))
         except OSError as error:
             raise OutputError(f"{job.folder}: the frames cannot be packed ({error}); choose another folder") from None
     return SequenceRecord(

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,7 +19,11 @@ from improvo.labeling.store import DONE, SETTINGS_FILE, SequenceRecord, read_rec
 from improvo.sequences.base import SequenceSettings
 from improvo.stability.settings import LabelSettings
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
-from improvo.types import Float64, UInt8
+from improvo.types import Float64, Int64, Mask, UInt8
+from improvo.untrusted.text import read_json_file, reason
+
+if TYPE_CHECKING:
+    from improvo.sequences import Sequence
 
 RUN_FILE, TRAJECTORY_FILE = "run.json", "trajectory.txt"
 
@@ -58,9 +61,9 @@ class LabeledSequence:
     def camera(self) -> Camera:
         """The pinhole camera of the processed frames."""
         try:
-            return Camera(**json.loads((self.folder / RUN_FILE).read_text())["camera"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{self.folder / RUN_FILE}: cannot be read ({error}); label it again") from None
+            return Camera(**read_json_file(self.folder / RUN_FILE, "label it again")["camera"])
+        except (OSError, LookupError, TypeError, ValueError, InputError) as error:
+            raise InputError(f"{self.folder / RUN_FILE}: cannot be read ({reason(error)}); label it again") from None
 
     @cached_property
     def cam_from_world(self) -> Float64:
@@ -81,17 +84,33 @@ class LabeledSequence:
         Raises:
             InputError: neither is there.
         """
-        return self._images(frame)
+        return self._images.image(frame)
+
+    def mask(self, frame: int) -> Mask | None:
+        """Where keypoints may be in a frame of the processed sequence (H, W); None is everywhere."""
+        return None if self.settings.mask is None else self._images.mask(frame)
 
     @cached_property
-    def _images(self) -> Callable[[int], UInt8]:
+    def _images(self) -> PackedImages | _RecordedImages:
         if self.record.packed:
-            return PackedImages(self.folder).__getitem__
+            return PackedImages(self.folder)
         from improvo.sequences import open_sequence
 
         sequence = open_sequence(self.record.path, self.settings)
-        rows = np.searchsorted(sequence.indices, self.frames.source_index)
-        return lambda frame: sequence[int(rows[frame])].image
+        return _RecordedImages(sequence, np.searchsorted(sequence.indices, self.frames.source_index))
+
+
+class _RecordedImages:
+    """Frames of the processed sequence from the recording; `rows` (F,) are theirs in the sequence."""
+
+    def __init__(self, sequence: Sequence, rows: Int64) -> None:
+        self._sequence, self._rows = sequence, rows
+
+    def image(self, frame: int) -> UInt8:
+        return self._sequence[int(self._rows[frame])].image
+
+    def mask(self, frame: int) -> Mask | None:
+        return self._sequence.mask(int(self._rows[frame]))
 
 
 def read_labels(folder: Path) -> list[LabeledSequence]:
@@ -103,6 +122,8 @@ def read_labels(folder: Path) -> list[LabeledSequence]:
     records = read_records(folder)
     try:
         values = SettingsRecord(folder / SETTINGS_FILE).read()
+        if not isinstance(values, dict):
+            raise TypeError
         settings = config.from_dict(SequenceSettings, values["sequence"], where=str(folder / SETTINGS_FILE))
         rule = config.from_dict(LabelSettings, values["labels"], where=str(folder / SETTINGS_FILE))
     except (KeyError, TypeError):

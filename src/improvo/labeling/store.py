@@ -16,7 +16,6 @@ manifest is made from the folders, so it can be lost without harm.
 from __future__ import annotations
 
 import dataclasses
-import json
 import shutil
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -26,6 +25,7 @@ from typing import Any
 from improvo.continuation import SettingsRecord
 from improvo.errors import InputError, OutputError
 from improvo.files import check_output_folder, make_output_folder, write_json, written_atomically
+from improvo.untrusted.text import read_json_file
 
 MANIFEST_FILE, SETTINGS_FILE, RECORD_FILE = "manifest.parquet", "settings.yaml", "label.json"
 DONE, FAILED = "done", "failed"
@@ -85,7 +85,7 @@ class LabelStore:
             self._discard()
         make_output_folder(folder, _COMMAND)
         for leftover in folder.glob(".*.partial*"):
-            if leftover.is_dir():
+            if leftover.is_dir() and not leftover.is_symlink():
                 shutil.rmtree(leftover, ignore_errors=True)
             else:
                 leftover.unlink(missing_ok=True)
@@ -159,12 +159,31 @@ def read_records(folder: Path) -> list[SequenceRecord]:
     for file in files:
         if file.parent.name.endswith(".partial"):
             continue
-        try:
-            record = SequenceRecord(**json.loads(file.read_text()))
-        except (OSError, ValueError, TypeError):
-            raise InputError(f"{file}: is damaged; remove it and run `improvo label` again") from None
+        record = _read_record(file)
         records.setdefault(record.name, record)  # labels come before an older failure of the same sequence
     return sorted(records.values(), key=lambda record: record.name)
+
+
+def _read_record(file: Path) -> SequenceRecord:
+    """The record in a file, which must be of the sequence that the file stands for.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    mend = "remove it and run `improvo label` again"
+    values = read_json_file(file, mend)
+    kinds: dict[str, Any] = {"str": str, "int": int, "float": (int, float), "bool": bool}
+    known = {field.name: kinds[str(field.type)] for field in dataclasses.fields(SequenceRecord)}
+    wrong = next((name for name, value in values.items() if not isinstance(value, known.get(name, ()))), None)
+    if wrong is None:
+        with suppress(TypeError):  # one is missing
+            record = SequenceRecord(**values)
+            done = file.name == RECORD_FILE
+            # the name becomes a path: it is taken from where the file lies, never from what the file says
+            named = file.parent.name if done else file.name.removeprefix(".").removesuffix(".failed.json")
+            if record.name == named and record.state == (DONE if done else FAILED):
+                return record
+    raise InputError(f"{file}: is damaged or of another sequence; {mend}")
 
 
 def sequence_names(paths: list[Path]) -> dict[str, Path]:

@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 from improvo.odometry.visual_odometry import MatchedFeatures
-from improvo.types import Features, Frame, UInt8
+from improvo.types import Features, Frame
 
 _AHEAD = 2  # frames; more cost memory and save no time
 
@@ -25,7 +25,7 @@ class DetectedFrame:
 
 
 def detected_ahead(
-    frames: Iterable[Frame], detect: Callable[[UInt8], Features], match: Callable[[Features], MatchedFeatures]
+    frames: Iterable[Frame], detect: Callable[[Frame], Features], match: Callable[[Features], MatchedFeatures]
 ) -> Iterator[DetectedFrame]:
     """The frames in order with their features and matches, computed ahead by one worker thread.
 
@@ -33,7 +33,7 @@ def detected_ahead(
 
     Args:
         frames: read in the worker thread.
-        detect: features of an image (H, W).
+        detect: features of a frame.
         match: matches a frame's features with those of the frame before; called in order.
     """
     iterator = iter(frames)
@@ -44,7 +44,7 @@ def detected_ahead(
         if frame is None:
             return None
         read = time.perf_counter()
-        features = detect(frame.image)
+        features = detect(frame)
         detected = time.perf_counter()
         matched = match(features)
         return DetectedFrame(frame, matched, read - start, detected - read, time.perf_counter() - detected)

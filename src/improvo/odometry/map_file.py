@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.files import written_atomically
 from improvo.types import SparseMap
+from improvo.untrusted.text import reason
 
 _FIELDS = (
     ("x", "<f4", "float"),
@@ -48,15 +50,18 @@ def read_map(path: Path) -> SparseMap:
     """
     try:
         content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); `improvo run` writes it") from None
+    except (OSError, MemoryError) as error:
+        raise InputError(f"{path}: cannot be read ({reason(error)}); `improvo run` writes it") from None
     header, separator, body = content.partition(b"end_header\n")
     lines = header.decode("ascii", "replace").split("\n")
-    count = next((int(line.split()[2]) for line in lines if line.startswith("element vertex")), -1)
+    counts = [line.split()[2] for line in lines if re.fullmatch(r"element vertex \d{1,12}\s*", line)]
+    count = int(counts[0]) if counts else -1
     properties = [line.split() for line in lines if line.startswith("property")]
     if not separator or count < 0 or "format binary_little_endian 1.0" not in lines:
         raise InputError(f"{path}: is no map that improvo wrote; run `improvo run` again")
     try:
+        if count == 0:
+            body = b""
         dtype = np.dtype([(name, _PLY_TYPES[kind]) for _, kind, name in properties])
         vertices = np.frombuffer(body, dtype, count)
         xyz = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)

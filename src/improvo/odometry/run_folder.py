@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,13 @@ from improvo.sequences import Sequence, SequenceSettings, open_sequence
 from improvo.stability.rule import IGNORE
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
 from improvo.types import Float64, Int64, SparseMap, Trajectory, UInt8
+from improvo.untrusted.text import read_json_file, reason
 
 _FORMER_KINDS = {"waiting": "initialising"}  # of events
+_MENDS = {  # by a word of the reason
+    "parallax": "the camera turned or stood still: move it sideways at the start (`improvo info` shows what it sees)",
+    "match": "`improvo info` tells whether the pictures are dark, blurred or without texture",
+}
 
 
 @dataclass(frozen=True)
@@ -55,12 +60,13 @@ class RunFolder:
         if not path.is_dir():
             raise InputError(f"{path}: no such folder; give the output folder of `improvo run`")
         try:
-            self.report = _with_present_names(json.loads((path / "run.json").read_text()))
+            self.report = _with_present_names(read_json_file(path / "run.json", "run `improvo run` again"))
             self._recorded_input = Path(self.report["input"]["path"])
             self.source_index: list[int] = self.report["frames"]["source_index"]
+            _check(self.report)
         except FileNotFoundError:
             raise InputError(f"{path}: has no run.json; give the output folder of `improvo run`") from None
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise InputError(f"{path / 'run.json'}: cannot be read ({error}); run `improvo run` again") from None
 
     @property
@@ -76,7 +82,11 @@ class RunFolder:
     @cached_property
     def camera(self) -> Camera:
         """The pinhole camera of the processed frames."""
-        return Camera(**self.report["camera"])
+        try:
+            return Camera(**self.report["camera"])
+        except (TypeError, ValueError, InputError) as error:
+            words = f"holds no camera ({reason(error)})"
+            raise InputError(f"{self.path / 'run.json'}: {words}; run `improvo run` again") from None
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -134,6 +144,14 @@ class RunFolder:
         Raises:
             InputError: there is no such frame in the run or in the recording.
         """
+        return self.sequence[self._row(frame_index)].image
+
+    def colour(self, frame_index: int) -> UInt8:
+        """The same in colour, (H, W, 3) RGB; three equal channels where the recording has none."""
+        return np.ascontiguousarray(self.sequence.colour(self._row(frame_index))[..., ::-1])
+
+    def _row(self, frame_index: int) -> int:
+        """The row of the recording's sequence that a processed frame is."""
         if not 0 <= frame_index < self.frames:
             raise InputError(f"{self.path}: has no frame {frame_index}; frames are 0 to {self.frames - 1}")
         row = self._row_of_index.get(self.source_index[frame_index])
@@ -141,7 +159,7 @@ class RunFolder:
             raise InputError(
                 f"{self.sequence.path}: has no frame {self.source_index[frame_index]}; is it the recording?"
             )
-        return self.sequence[row].image
+        return row
 
     @cached_property
     def _first_rows(self) -> tuple[Int64, Int64]:
@@ -197,6 +215,35 @@ class RunFolder:
             frame_index - self.birth[rows],
             self.stability_of_rows[rows],
         )
+
+
+def why_no_pose(report: dict[str, Any]) -> str | None:
+    """Why no frame of a run has a pose, and what helps, from its run.json; None where some have."""
+    if report["frames"]["tracked"]:
+        return None
+    details = [str(event["detail"]) for event in report["events"] if event["kind"] == "initialising"]
+    reason = details[-1] if details else "the run ended before a map could start"
+    mend = next((mend for word, mend in _MENDS.items() if word in reason), _MENDS["match"])
+    return f"no frame has a pose: {reason}; {mend}"
+
+
+def _check(report: dict[str, Any]) -> None:
+    """Refuse a run.json that is not as `improvo run` writes it.
+
+    Raises:
+        ValueError, KeyError, TypeError: it is not.
+    """
+    frames, indices = report["frames"], report["frames"]["source_index"]
+    lists = [indices, frames.get("lost_frames", []), [frames.get("tracked", 0)]]
+    if not all(isinstance(row, list) and all(type(number) is int for number in row) for row in lists):
+        raise ValueError("its frames are no numbers")
+    if any(b <= a for a, b in pairwise(indices)) or not all(0 <= number < 1 << 40 for number in indices):
+        raise ValueError("its frames are out of order")
+    if not all(isinstance(report[name], dict) for name in ("camera", "configuration")):
+        raise ValueError("it has no camera or no configuration")
+    for event in report["events"]:
+        if not isinstance(event["kind"], str):
+            raise ValueError("an event is of no kind")
 
 
 def _with_present_names(report: dict[str, Any]) -> dict[str, Any]:

@@ -9,7 +9,9 @@ from types import TracebackType
 import numpy as np
 
 from improvo.frontend import Frontend
+from improvo.frontend.masking import features_of
 from improvo.geometry.camera import Camera
+from improvo.odometry.checks import OneThread, check_features, check_frame, check_time
 from improvo.odometry.events import Event, EventLog
 from improvo.odometry.mapper import Mapper
 from improvo.odometry.paper import PaperMapper
@@ -82,8 +84,10 @@ class VisualOdometry:
         self._chain = TrackChain()
         self._newest: View | None = None
         self._matched_before: tuple[Float32, Float32] | None = None  # keypoints, unit descriptors of the last `match`
+        self._descriptor_width = 0
         self._mapper: Mapper | None = None
         self._finished = False
+        self._thread = OneThread()
 
     def __enter__(self) -> VisualOdometry:
         return self
@@ -97,18 +101,25 @@ class VisualOdometry:
         """Process the next frame.
 
         Raises:
-            RuntimeError: the odometry has finished.
+            RuntimeError: the odometry has finished, or another thread is tracking with it.
+            InputError: the picture has another size or type than the camera's; nothing has changed then.
         """
-        self._refuse_if_finished()
-        return self.track_features(self._frontend(frame.image), frame.time)
+        with self._thread.alone():
+            self._refuse_if_finished()
+            check_frame(frame, self._camera)
+            return self.track_features(features_of(self._frontend, frame), frame.time)
 
     def track_features(self, features: Features, time: float) -> TrackedFrame:
         """As `track`, with the features of the frame and its time in seconds at hand."""
-        self._refuse_if_finished()
-        return self.track_matched(self.match(features), time)
+        with self._thread.alone():
+            self._refuse_if_finished()
+            check_time(time)
+            return self.track_matched(self.match(features), time)
 
     def match(self, features: Features) -> MatchedFeatures:
         """Match the next frame with the one before; frames in order, each once, and it may run ahead in a thread."""
+        before = self._matched_before
+        check_features(features, self._descriptor_width if before is not None else None)
         descriptors = unit_descriptors(features)
         matches = None
         if self._matched_before is not None:
@@ -118,11 +129,16 @@ class VisualOdometry:
                 limit = self._settings.matching.flow_outlier_limit * self._camera.width
                 matches = without_flow_outliers(matches, keypoints_before, features.keypoints, limit)
         self._matched_before = features.keypoints, descriptors
+        self._descriptor_width = features.descriptors.shape[1]
         return MatchedFeatures(features, descriptors, matches)
 
     def track_matched(self, matched: MatchedFeatures, time: float) -> TrackedFrame:
         """As `track`, with what `match` gave for the frame and its time in seconds at hand."""
-        self._refuse_if_finished()
+        with self._thread.alone():
+            self._refuse_if_finished()
+            return self._track(matched, time)
+
+    def _track(self, matched: MatchedFeatures, time: float) -> TrackedFrame:
         view = self._extend_tracks(matched, time)
         if self._mapper is None:
             mapper: type[Mapper] = RobustMapper if self._settings.mode == "robust" else PaperMapper
@@ -142,9 +158,10 @@ class VisualOdometry:
 
     def finish(self) -> None:
         """The sequence is over: all poses and points become final. A second call does nothing."""
-        if self._mapper is not None and not self._finished:
-            self._mapper.finish()
-        self._finished = True
+        with self._thread.alone():
+            if self._mapper is not None and not self._finished:
+                self._mapper.finish()
+            self._finished = True
 
     @property
     def pose(self) -> Float64 | None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 from improvo.errors import InputError
 from improvo.report.page import Page
+from improvo.untrusted.text import read_json_file
 
 # evaluation -> (title, what the numbers mean)
 EVALUATIONS = {
@@ -70,11 +72,9 @@ def _tables(page: Page, folder: Path, name: str) -> None:
 
 def _subject(path: Path) -> str:
     """What was evaluated, in a few words: the recordings, or the estimate."""
-    try:
-        results = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); run the evaluation again") from None
+    results = _read(path)
     entries = results.get("sequences") or results.get("sequence_rows") or []
+    entries = entries if isinstance(entries, list) else []
     found = [entry.get("name") or entry.get("sequence") for entry in entries if isinstance(entry, dict)]
     names = list(dict.fromkeys(str(name) for name in found if name))
     if names:
@@ -83,12 +83,22 @@ def _subject(path: Path) -> str:
     return estimate.parent.name if estimate.name == "trajectory.txt" else estimate.name
 
 
+def _read(path: Path) -> dict[str, Any]:
+    """The results.
+
+    Raises:
+        InputError: missing, or damaged.
+    """
+    mend = "run the evaluation again"
+    try:
+        return read_json_file(path, mend)
+    except FileNotFoundError:
+        raise InputError(f"{path}: is missing; {mend}") from None
+
+
 _LONGEST = 200_000  # characters of a result that are worth embedding
 
 
 def _indented(path: Path) -> str:
-    try:
-        text = json.dumps(json.loads(path.read_text()), indent=1)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); run the evaluation again") from None
+    text = json.dumps(_read(path), indent=1)
     return text if len(text) <= _LONGEST else text[:_LONGEST] + f"\n... {len(text) - _LONGEST} more characters"

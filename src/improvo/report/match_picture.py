@@ -16,7 +16,7 @@ from improvo.geometry.camera import Camera
 from improvo.report.canvas import Canvas, captioned, stacked
 from improvo.report.palettes import PALETTES, Palette
 from improvo.tracking.matching import mutual_nearest_neighbours
-from improvo.types import Features, Float32, Float64, Int64, UInt8
+from improvo.types import Features, Float32, Float64, Int64, Mask, UInt8
 
 _GOOD_ERROR = 3.0  # pixels, paper
 _EPIPOLAR_ERROR = 2.0  # pixels, of the five-point estimate where there is no depth
@@ -41,13 +41,17 @@ def paint_matches(
     camera: Camera,
     palette: Palette = PALETTES["paper"],
     width: int = 640,
+    masks: tuple[Mask | None, Mask | None] = (None, None),
 ) -> UInt8:
     """Three panels: detections in A; detections in B with the flow of the matches; A's points carried into B.
 
     With depth, the pose comes from 3D-to-2D matches as in the paper. Without, from the five-point method, and a point
     is carried to the nearest place of its epipolar line.
     """
-    a, b = frontend(image_a), frontend(image_b)
+    a, b = (
+        frontend(image) if mask is None else frontend(image, mask)
+        for image, mask in zip((image_a, image_b), masks, strict=True)
+    )
     matches = mutual_nearest_neighbours(a, b)
     panel_a = _panel(image_a, width)
     panel_a.dots(a.keypoints, _fill(palette.keypoint, len(a)), 1.4)

@@ -8,7 +8,7 @@ import numpy as np
 
 from improvo.report.canvas import Canvas
 from improvo.report.palettes import PALETTES, RGB, Palette
-from improvo.types import Features, Float32, Float64, UInt8
+from improvo.types import Features, Float32, Float64, Mask, UInt8
 
 _PINK: RGB = (255, 105, 200)
 _SUPPRESSED = 0.5  # keypoints of a lower stability count as suppressed
@@ -20,13 +20,18 @@ _MAX_REGIONS = 6
 class StabilityFrontend(Protocol):
     """A network with a stability head."""
 
-    def __call__(self, image: UInt8) -> Features: ...
+    def __call__(self, image: UInt8, mask: Mask | None = None) -> Features: ...
 
     def stability_map(self, image: UInt8) -> Float32: ...
 
 
 def paint_stability(
-    image: UInt8, frontend: StabilityFrontend, name: str, palette: Palette = PALETTES["paper"], width: int = 1280
+    image: UInt8,
+    frontend: StabilityFrontend,
+    name: str,
+    palette: Palette = PALETTES["paper"],
+    width: int = 1280,
+    mask: Mask | None = None,
 ) -> UInt8:
     """The picture of one frame: heat from stable to unstable, keypoints, circles around suppressed regions.
 
@@ -34,7 +39,7 @@ def paint_stability(
         InputError: the network has no stability head.
     """
     stability = frontend.stability_map(image)
-    features = frontend(image)
+    features = frontend(image) if mask is None else frontend(image, mask)
     assert features.stability is not None  # stability_map has raised otherwise
     heat = palette.ramp_colours(1 - stability.ravel(), 0, 1).reshape(*stability.shape, 3)
     mixed = (0.55 * image[..., None] + 0.45 * heat).astype(np.uint8)

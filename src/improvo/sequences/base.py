@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
+from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration
 from improvo.types import Float32, Float64, Trajectory, UInt8
 
@@ -30,7 +31,9 @@ class SequenceSettings:
     end: int | None = None  # one past the last frame of the recording
     stride: int = 1  # every n-th frame
     max_frames: int | None = None  # after the stride
+    undistorted_fov: float | None = None  # degrees of a wide lens that are seen; None keeps the middle's resolution
     width: int | None = None  # resize to this width, keeping the aspect ratio
+    mask: str | None = None  # an image for all frames, or a folder with one for each; white is used, black is not
     topic: str | None = None  # the image topic of a ROS bag, or the camera of a recording with several (cam1, image_3)
 
 
@@ -46,6 +49,7 @@ class Recording(ABC):
     path: Path
     times: Float64  # (N,) seconds, strictly increasing
     calibration: Calibration | None = None  # of the raw images, with distortion; None where the format has none
+    calibration_error: InputError | None = None  # why the calibration that lies in it cannot be used
     ground_truth: Trajectory | None = None  # camera-to-world, rows at their own time stamps
     notes: tuple[str, ...] = ()  # what was odd but could be handled, one line each
 
@@ -71,6 +75,22 @@ class Recording(ABC):
         Raises:
             UnreadableFrameError: it cannot be decoded.
         """
+
+    def own_calibration(self, *sources: Callable[[], Calibration | None]) -> Calibration | None:
+        """The calibration of the first of these that has one.
+
+        An error is kept, not raised: who gives his own camera does not need this one. `Sequence` raises it where it is
+        needed.
+        """
+        for source in sources:
+            try:
+                calibration = source()
+            except InputError as error:
+                self.calibration_error = error
+                return None
+            if calibration is not None:
+                return calibration
+        return None
 
     def depth(self, index: int) -> Float32 | None:
         """Depth in metres (H, W) registered to the raw image, NaN where missing; None where there is none."""

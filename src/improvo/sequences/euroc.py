@@ -7,16 +7,19 @@ the sensors carry it to the camera. `--topic cam1` chooses another camera. TUM-V
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from improvo.errors import InputError
-from improvo.geometry.camera_files import Calibration, load_calibration, parse_yaml
+from improvo.geometry.camera_files import load_calibration, parse_yaml
 from improvo.geometry.se3 import inverse
+from improvo.geometry.text_files import read_text
 from improvo.geometry.trajectory_files import clean_poses, increasing_order, read_trajectory_report
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.images import list_images, read_image
+from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.images import list_images, listed_file
 from improvo.types import Float64, Trajectory, UInt8
 
 _TRUTH = ("state_groundtruth_estimate0", "vicon0", "mocap0")
@@ -37,33 +40,45 @@ class EurocMav(Recording):
         if not _is_camera(folder):
             known = ", ".join(sorted(file.name for file in root.iterdir() if _is_camera(file)))
             raise InputError(f"{root}: has no camera `{name}`; --topic can be one of {known}")
-        self.times, self._images, notes = _read_images(folder)
-        body_from_cam = np.eye(4)
-        if (folder / "sensor.yaml").is_file():
-            self.calibration = load_calibration(str(folder / "sensor.yaml"))
-            body_from_cam = _body_from_sensor(folder / "sensor.yaml")
-        elif (chain := root.parent / "dso" / "camchain.yaml").is_file():
-            self.calibration, body_from_cam = _from_kalibr_chain(chain, name)
+        self.times, files, notes = _read_images(folder)
+        self._images = ImageFiles(files, path)
+        notes += self._images.notes
+        sensor, chain = folder / "sensor.yaml", root.parent / "dso" / "camchain.yaml"
+        body_from_cam: Float64 | None = np.eye(4)
+        if sensor.is_file():
+            self.calibration = self.own_calibration(lambda: load_calibration(str(sensor)))
+            body_from_cam = self._place(lambda: _body_from_sensor(sensor))
+        elif chain.is_file():
+            self.calibration = self.own_calibration(lambda: load_calibration(str(chain), name))
+            body_from_cam = self._place(lambda: _body_from_chain(chain, name))
         for truth in (root / name / "data.csv" for name in _TRUTH):
-            if truth.is_file():
+            if truth.is_file() and body_from_cam is not None:
                 world_from_sensor, problems = read_trajectory_report(truth, "euroc")
                 notes += problems
-                sensor = truth.with_name("sensor.yaml")
-                body_from_sensor = _body_from_sensor(sensor) if sensor.is_file() else np.eye(4)
+                body = truth.with_name("sensor.yaml")
+                body_from_sensor = _body_from_sensor(body) if body.is_file() else np.eye(4)
                 poses = world_from_sensor.world_from_cam @ inverse(body_from_sensor) @ body_from_cam
                 self.ground_truth = Trajectory(world_from_sensor.times, poses, world_from_sensor.segment)
                 break
         self.notes = tuple(notes)
+
+    def _place(self, read: Callable[[], Float64]) -> Float64 | None:
+        """Where the camera is on the body; None, and no ground truth, where the file is broken."""
+        try:
+            return read()
+        except InputError as error:
+            self.calibration_error = self.calibration_error or error
+            return None
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
         return path.is_dir() and _mav_folder(path) is not None
 
     def source(self, index: int) -> str:
-        return str(self._images[index])
+        return str(self._images.files[index])
 
     def image(self, index: int) -> UInt8:
-        return read_image(self._images[index])
+        return self._images.read(index)
 
 
 def _mav_folder(path: Path) -> Path | None:
@@ -84,16 +99,12 @@ def _read_images(folder: Path) -> tuple[Float64, list[Path], list[str]]:
     table = folder / "data.csv"
     rows, bad = [], 0
     if table.is_file():
-        try:
-            lines = table.read_text(encoding="utf-8").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{table}: cannot be read ({error}); copy it again") from None
-        for line in lines:
-            fields = [field.strip() for field in line.split(",")]
-            if not line.strip() or line.startswith("#"):
+        for number, line in enumerate(read_text(table, "a list of images", "copy it again").splitlines()):
+            fields = [field.strip() for field in re.split(r"[,;\s]+", line.strip())]
+            if not line.strip() or line.startswith("#") or (number == 0 and not fields[0].isdecimal()):
                 continue
             if len(fields) >= 2 and re.fullmatch(r"\d{1,19}", fields[0]) and fields[1]:
-                rows.append((int(fields[0]), folder / "data" / fields[1]))
+                rows.append((int(fields[0]), listed_file(folder / "data", fields[1])))
             else:
                 bad += 1
     else:
@@ -114,17 +125,16 @@ def _body_from_sensor(path: Path) -> Float64:
     Raises:
         InputError: not a rigid motion.
     """
-    content = parse_yaml(path.read_text(encoding="utf-8", errors="replace"), path)
+    content = parse_yaml(read_text(path, "a calibration"), path)
     matrix = content.get("T_BS", {"data": np.eye(4).ravel().tolist()})
     return _rigid(matrix.get("data") if isinstance(matrix, dict) else matrix, path, "T_BS")
 
 
-def _from_kalibr_chain(path: Path, camera: str) -> tuple[Calibration, Float64]:
-    content = parse_yaml(path.read_text(encoding="utf-8", errors="replace"), path)
+def _body_from_chain(path: Path, camera: str) -> Float64:
+    content = parse_yaml(read_text(path, "a calibration"), path)
     entry = content.get(camera)
     matrix = entry.get("T_cam_imu") if isinstance(entry, dict) else None
-    cam_from_body = np.eye(4) if matrix is None else _rigid(matrix, path, "T_cam_imu")
-    return load_calibration(str(path), camera), inverse(cam_from_body)
+    return np.eye(4) if matrix is None else inverse(_rigid(matrix, path, "T_cam_imu"))
 
 
 def _rigid(values: object, path: Path, name: str) -> Float64:

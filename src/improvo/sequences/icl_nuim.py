@@ -6,16 +6,21 @@ negative fy of its intrinsics says; they are reflected here, so that K is ordina
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, folder_calibration
+from improvo.geometry.text_files import read_text
 from improvo.geometry.trajectory_files import read_trajectory_report
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.images import list_images, read_depth, read_image
+from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.images import list_images, listed_file, read_depth
+from improvo.sequences.rates import depth_scale
 from improvo.types import Float32, Trajectory, UInt8
+from improvo.untrusted.names import number_of
 
 DEPTH_SCALE = 5000.0
 FPS = 30.0
@@ -33,29 +38,30 @@ class IclNuim(Recording):
         if not frames:
             raise InputError(f"{path}: has no rgb images named by their frame numbers; unpack the archive again")
         self._numbers = sorted(frames)
-        self._images = [frames[number][0] for number in self._numbers]
+        self._images = ImageFiles((frames[number][0] for number in self._numbers), path)
+        self.notes = tuple(self._images.notes)
         self._depth = [frames[number][1] for number in self._numbers]
         rate = settings.fps or FPS
         self.times = np.array(self._numbers, np.float64) / rate
-        self.calibration = folder_calibration(path) or Calibration(
-            "ICL-NUIM", (481.2, 480.0, 319.5, 239.5), size=(640, 480)
-        )
-        self._scale = self.calibration.depth_scale or DEPTH_SCALE
+        published = Calibration("ICL-NUIM", (481.2, 480.0, 319.5, 239.5), size=(640, 480))
+        self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: published)
+        self._scale = depth_scale(self.calibration, settings) or DEPTH_SCALE
         truth = next(iter(sorted(path.glob("*.gt.freiburg"))), None)
         if truth is not None:
-            published, self.notes = read_trajectory_report(truth, "tum")
-            poses = _UP_TO_DOWN @ published.world_from_cam @ _UP_TO_DOWN
-            self.ground_truth = Trajectory(published.times / rate, poses)
+            poses_up, problems = read_trajectory_report(truth, "tum")
+            self.notes += problems
+            poses = _UP_TO_DOWN @ poses_up.world_from_cam @ _UP_TO_DOWN
+            self.ground_truth = Trajectory(poses_up.times / rate, poses)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
         return path.is_dir() and (path / "rgb").is_dir() and any(path.glob("*.gt.freiburg"))
 
     def source(self, index: int) -> str:
-        return str(self._images[index])
+        return str(self._images.files[index])
 
     def image(self, index: int) -> UInt8:
-        return read_image(self._images[index])
+        return self._images.read(index)
 
     def depth(self, index: int) -> Float32 | None:
         file = self._depth[index]
@@ -67,19 +73,19 @@ def _associations(path: Path) -> dict[int, tuple[Path, Path | None]]:
     table = path / "associations.txt"
     frames: dict[int, tuple[Path, Path | None]] = {}
     if table.is_file():
-        for line in table.read_text(encoding="utf-8", errors="replace").splitlines():
+        for line in read_text(table, "a list of images").splitlines():
             fields = line.split()
             if len(fields) < 4 or line.startswith("#"):
                 continue
             # either pair may come first: rows are "number file number file"
-            pair = {Path(name).parts[0]: (number, name) for number, name in (fields[:2], fields[2:4])}
+            pair = {re.split(r"[/\\]", name)[0]: (number, name) for number, name in (fields[:2], fields[2:4])}
             if "rgb" in pair and _is_number(pair["rgb"][0]):
-                depth = path / pair["depth"][1] if "depth" in pair else None
-                frames[int(float(pair["rgb"][0]))] = (path / pair["rgb"][1], depth)
+                depth = listed_file(path, pair["depth"][1]) if "depth" in pair else None
+                frames[int(float(pair["rgb"][0]))] = (listed_file(path, pair["rgb"][1]), depth)
     if not frames:
         for file in list_images(path / "rgb"):
-            if file.stem.isdigit():
-                frames[int(file.stem)] = (file, path / "depth" / f"{file.stem}.png")
+            if (number := number_of(file.stem)) is not None:
+                frames[number] = (file, path / "depth" / f"{file.stem}.png")
     return frames
 
 

@@ -1,7 +1,8 @@
-"""Image files and encoded images: decoded whole, or refused."""
+"""Encoded images: decoded whole, or refused."""
 
 from __future__ import annotations
 
+import io
 import os
 import re
 from pathlib import Path
@@ -10,9 +11,17 @@ import cv2
 import numpy as np
 
 from improvo.sequences.base import UnreadableFrameError
+from improvo.sequences.grey_levels import to_8_bits
 from improvo.types import Float32, UInt8
+from improvo.untrusted.limits import MAX_PICTURE_BYTES
+from improvo.untrusted.pictures import check_picture
+from improvo.untrusted.text import reason
 
-IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".pnm"})
+IMAGE_SUFFIXES = frozenset(
+    {".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".pnm", ".jp2"}
+)
+_END_OF_JPEG = b"\xff\xd9"
+_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # in the coded data of a JPEG: neither stuffing nor a restart
 
 # OpenCV's messages about damaged files would drown the one line that says what to do
 if "OPENCV_LOG_LEVEL" not in os.environ:
@@ -20,13 +29,21 @@ if "OPENCV_LOG_LEVEL" not in os.environ:
 
 
 def read_image(path: Path) -> UInt8:
-    """(H, W) grey or (H, W, 3) BGR, 8 bits.
+    """(H, W) grey or (H, W, 3) BGR, 8 bits: of deeper images the upper eight.
 
     Raises:
         UnreadableFrameError: missing, truncated, or not an image.
     """
-    image = decode(_bytes(path), cv2.IMREAD_ANYCOLOR)
-    return image.astype(np.uint8, copy=False)
+    return to_8_bits(decode(file_bytes(path), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH))
+
+
+def read_grey(path: Path) -> UInt8:
+    """(H, W) grey, 8 bits.
+
+    Raises:
+        UnreadableFrameError: missing, truncated, or not an image.
+    """
+    return np.asarray(decode(file_bytes(path), cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
 def read_depth(path: Path, scale: float) -> Float32:
@@ -35,7 +52,7 @@ def read_depth(path: Path, scale: float) -> Float32:
     Raises:
         UnreadableFrameError: missing, truncated, or not an image of one channel.
     """
-    return depth_in_metres(decode(_bytes(path), cv2.IMREAD_UNCHANGED), scale)
+    return depth_in_metres(decode(file_bytes(path), cv2.IMREAD_UNCHANGED), scale)
 
 
 def depth_in_metres(values: np.ndarray, scale: float) -> Float32:
@@ -51,7 +68,7 @@ def depth_in_metres(values: np.ndarray, scale: float) -> Float32:
 
 
 def decode(data: bytes, flags: int) -> np.ndarray:
-    """An encoded image.
+    """An encoded image. What follows its end (the video of a motion photo, say) is left out.
 
     Raises:
         UnreadableFrameError: truncated, or no image that OpenCV knows. (OpenCV fills the rest of a truncated JPEG or
@@ -59,15 +76,89 @@ def decode(data: bytes, flags: int) -> np.ndarray:
     """
     if not data:
         raise UnreadableFrameError("the file is empty")
-    if _is_truncated(data):
+    try:
+        check_picture(data)
+    except ValueError as error:
+        raise UnreadableFrameError(str(error)) from None
+    if data.startswith(b"\xff\xd8"):
+        return _decode_jpeg(data, flags)
+    if data.startswith(b"\x89PNG"):
+        end = _end_of_png(data)
+        if end is None:
+            raise UnreadableFrameError("the image is truncated")
+        data = data[:end]
+    return _decoded(data, flags)
+
+
+def _decode_jpeg(data: bytes, flags: int) -> np.ndarray:
+    end = _end_of_jpeg(data)
+    if end is not None:
+        return _decoded(data[:end], flags)
+    if data.endswith(b"\0" * 16):  # a file that was made at full size and never filled
+        data = data.rstrip(b"\0")
+    if not _is_whole(data):
         raise UnreadableFrameError("the image is truncated")
+    return _decoded(data + _END_OF_JPEG, flags)
+
+
+def _is_whole(data: bytes) -> bool:
+    """Whether a JPEG without an end marker holds all of its picture: nothing that could follow changes it.
+
+    Decoded by Pillow, which is silent about damage where OpenCV's decoder writes to the terminal.
+    """
+    from PIL import Image
+
+    seen = set()
+    try:
+        for more in (b"", b"\x00" * 64, b"\xa5\x5a" * 32):
+            with Image.open(io.BytesIO(data + more + _END_OF_JPEG)) as image:
+                seen.add(hash(image.tobytes()))
+    except Exception:  # Pillow raises errors of many kinds, from OSError to SyntaxError
+        return False
+    return len(seen) == 1
+
+
+def _decoded(data: bytes, flags: int) -> np.ndarray:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:
+    except (cv2.error, MemoryError):
         image = None
     if image is None or image.size == 0:
         raise UnreadableFrameError("not a readable image")
     return np.asarray(image)
+
+
+def _end_of_jpeg(data: bytes) -> int | None:
+    """Where the first image of a JPEG file ends, None where its end marker is missing."""
+    position = 2
+    while position + 4 <= len(data):
+        if data[position] != 0xFF:
+            return None
+        marker = data[position + 1]
+        if marker == 0xFF:  # padding before a marker
+            position += 1
+            continue
+        if marker == 0xD9:
+            return position + 2
+        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+        if marker == 0xDA:
+            found = _MARKER.search(data, position)
+            if found is None:
+                return None
+            position = found.start()
+            if data[position + 1] == 0xD9:
+                return position + 2
+    return len(data) if data[position : position + 2] == _END_OF_JPEG else None
+
+
+def _end_of_png(data: bytes) -> int | None:
+    position = 8
+    while position + 12 <= len(data):
+        kind = data[position + 4 : position + 8]
+        position += 12 + int.from_bytes(data[position : position + 4], "big")
+        if kind == b"IEND":
+            return position if position <= len(data) else None
+    return None
 
 
 def grey(image: UInt8) -> UInt8:
@@ -86,21 +177,32 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(files, key=lambda path: natural_key(path.name))
 
 
+def listed_file(folder: Path, name: str) -> Path:
+    """The file that a list in `folder` names, also with Windows' separators or with the path of another machine."""
+    name = name.strip().strip("\"'")
+    plain = name.replace("\\", "/")
+    parts = [part for part in plain.split("/") if part not in ("", ".")]
+    tails = ["/".join(parts[-count:]) for count in (len(parts), 3, 2, 1) if 0 < count <= len(parts)]
+    candidates = [folder / name, folder / plain, *(folder / tail for tail in tails)]
+    return next((file for file in candidates if file.is_file()), folder / plain)
+
+
 def natural_key(name: str) -> list[tuple[int, str]]:
-    """Sorts numbers in names by value."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name) if part]
+    """Sorts numbers in names by value, however long they are."""
+    parts = [part for part in re.split(r"(\d+)", name) if part]
+    digits = [part.lstrip("0") if part.isdecimal() else "" for part in parts]
+    return [(len(n), n) if part.isdecimal() else (-1, part) for part, n in zip(parts, digits, strict=True)]
 
 
-def _bytes(path: Path) -> bytes:
+def file_bytes(path: Path) -> bytes:
+    """The content of a file.
+
+    Raises:
+        UnreadableFrameError: it cannot be read.
+    """
     try:
+        if path.stat().st_size > MAX_PICTURE_BYTES:
+            raise UnreadableFrameError("the file is too large for a picture")
         return path.read_bytes()
-    except OSError as error:
-        raise UnreadableFrameError(error.strerror or str(error)) from None
-
-
-def _is_truncated(data: bytes) -> bool:
-    if data.startswith(b"\xff\xd8"):
-        return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
-    if data.startswith(b"\x89PNG"):
-        return b"IEND" not in data[-64:]
-    return False
+    except (OSError, ValueError, MemoryError) as error:
+        raise UnreadableFrameError(reason(error)) from None

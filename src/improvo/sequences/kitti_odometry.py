@@ -13,9 +13,11 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, folder_calibration
 from improvo.geometry.se3 import inverse, rigid
+from improvo.geometry.text_files import read_text
 from improvo.geometry.trajectory_files import increasing_order, read_times, read_trajectory_report
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.images import list_images, read_image
+from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.images import list_images
 from improvo.types import Float64, Trajectory, UInt8
 
 FPS = 10.0
@@ -32,27 +34,36 @@ class KittiOdometry(Recording):
         number = next((n for n in _CAMERAS if _has_images(path / f"image_{n}")), None)
         if number is None:
             raise InputError(f"{path}: has no images in image_0 or image_2, so it is no KITTI odometry sequence")
-        self._images = list_images(path / f"image_{number}")
+        files = list_images(path / f"image_{number}")
         notes: list[str] = []
-        order = np.arange(len(self._images))
+        order = np.arange(len(files))
         if (path / "times.txt").is_file() and settings.fps is None:
-            times = read_times(path / "times.txt")
-            if len(times) < len(self._images):
-                counts = f"{len(times)} times for {len(self._images)} images"
+            times, said = read_times(path / "times.txt")
+            notes += said
+            if len(times) < len(files):
+                counts = f"{len(times)} times for {len(files)} images"
                 raise InputError(f"{path / 'times.txt'}: has {counts}; repair it or give --fps")
-            if len(times) > len(self._images):
-                notes.append(f"{path}: {len(times) - len(self._images)} of {len(times)} images are missing at the end")
-            times = times[: len(self._images)]
+            if len(times) > len(files):
+                notes.append(f"{path}: {len(times) - len(files)} of {len(times)} images are missing at the end")
+            times = times[: len(files)]
             order, repeated = increasing_order(times)
             notes += [f"{path}: {repeated} images repeat a time stamp and were left out"] if repeated else []
         else:
             times = order / (settings.fps or FPS)
-        self._images, self.times = [self._images[row] for row in order], times[order]
+        self._images, self.times = ImageFiles([files[row] for row in order], path), times[order]
+        notes += self._images.notes
         cam_from_cam0 = np.eye(4)
-        self.calibration = folder_calibration(path)
+        published: list[Calibration] = []
         if (path / "calib.txt").is_file():
-            calibration, cam_from_cam0 = _read_calibration(path / "calib.txt", number)
-            self.calibration = self.calibration or calibration
+            try:
+                calibration, cam_from_cam0 = _read_calibration(path / "calib.txt", number)
+                published.append(calibration)
+            except InputError as error:
+                self.calibration_error = error
+                notes += [f"{path}: poses are taken as those of these images' camera"] if number else []
+        self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: next(iter(published), None))
+        if self.calibration is not None:
+            self.calibration_error = None
         poses_file = next((file for file in _pose_files(path) if file.is_file()), None)
         if poses_file is not None:
             self.ground_truth, problems = _read_poses(poses_file, times, cam_from_cam0)
@@ -64,10 +75,10 @@ class KittiOdometry(Recording):
         return (path / "calib.txt").is_file() and any(_has_images(path / f"image_{n}") for n in _CAMERAS)
 
     def source(self, index: int) -> str:
-        return str(self._images[index])
+        return str(self._images.files[index])
 
     def image(self, index: int) -> UInt8:
-        return read_image(self._images[index])
+        return self._images.read(index)
 
 
 def _has_images(folder: Path) -> bool:
@@ -82,11 +93,12 @@ def _pose_files(path: Path) -> tuple[Path, ...]:
 def _read_calibration(path: Path, number: int) -> tuple[Calibration, Float64]:
     """The calibration of camera `number`, and cam_from_cam0 (4, 4)."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_text(path, "a calibration").splitlines()
         rows = {line.split(":")[0].strip(): line.split(":", 1)[1].split() for line in lines if ":" in line}
-        projection = np.array(rows[f"P{number}"], np.float64).reshape(3, 4)
+        row = rows.get(f"P{number}", rows.get(f"P_rect_0{number}"))
+        projection = np.array(row or [], np.float64).reshape(3, 4)
         cam_from_cam0 = rigid(np.eye(3), np.linalg.solve(projection[:, :3], projection[:, 3]).astype(np.float64))
-    except (OSError, UnicodeDecodeError, KeyError, ValueError, np.linalg.LinAlgError):
+    except (ValueError, np.linalg.LinAlgError):
         raise InputError(f"{path}: has no row `P{number}:` with 12 numbers; repair it or give --camera") from None
     fx, fy, cx, cy = (float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     calibration = Calibration(str(path), (fx, fy, cx, cy))
@@ -105,7 +117,7 @@ def _read_poses(path: Path, times: Float64, cam_from_cam0: Float64) -> tuple[Tra
 
 def _at_least(times: Float64, path: Path) -> Float64:
     """The images' times, continued where there are more poses than images (a shortened copy)."""
-    count = sum(1 for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip())
+    count = sum(1 for line in read_text(path, "poses").splitlines() if line.strip())
     step = float(np.median(np.diff(times))) if len(times) > 1 else 1 / FPS
     extra = max(0, count - len(times))
     return np.concatenate([times, times[-1] + step * np.arange(1, extra + 1)])

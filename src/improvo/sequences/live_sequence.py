@@ -67,7 +67,9 @@ class LiveSequence(Sequence):
                 if index % self.settings.stride or (image.shape[1], image.shape[0]) != self._raw_size:
                     continue
                 self._so_far.append(time)
-                yield Frame(index, time, self._rectifier.image(grey(image)), self._live.source(index))
+                yield Frame(
+                    index, time, self._rectifier.image(grey(image)), self._live.source(index), self._mask(index)
+                )
         finally:
             self._live.close()
 

@@ -14,14 +14,21 @@ import cv2
 import numpy as np
 
 from improvo.errors import InputError
-from improvo.geometry.camera_files import Calibration
-from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_folder import frame_rate
-from improvo.sequences.images import natural_key, read_depth, read_image
+from improvo.geometry.camera_files import Calibration, camera_of
+from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
+from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.images import listed_file, natural_key, read_depth
+from improvo.sequences.rates import frame_rate
 from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
 from improvo.types import Float32, Float64, UInt8
 
-_BROWN = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
+_NAMES = ("transforms.json", "transforms_train.json")
+_NO_LENS = {
+    *("frames", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov"),
+    *("aabb_scale", "scale", "offset", "aabb", "render_aabb", "sharpness", "colmap_im_id", "applied_scale"),
+    *("applied_transform", "orientation_override", "train_filenames", "val_filenames", "test_filenames", "up"),
+    *("depth_unit_scale_factor", "timestamp", "time", "integer_depth_scale", "enable_depth_loading", "rotation"),
+}
 
 
 class Nerfstudio(Recording):
@@ -31,23 +38,24 @@ class Nerfstudio(Recording):
 
     def __init__(self, path: Path, settings: SequenceSettings) -> None:
         self.path = path
-        file = path / "transforms.json" if path.is_dir() else path
+        inside = (path / name for name in _NAMES if (path / name).is_file())
+        file = next(inside, path / _NAMES[0]) if path.is_dir() else path
         content = read_json(file)
         frames = content.get("frames")
         frames = [f for f in frames if isinstance(f, dict) and f.get("file_path")] if isinstance(frames, list) else []
         if not frames:
             raise InputError(f"{file}: lists no frames with a file_path; export it again")
         frames.sort(key=lambda frame: natural_key(str(frame["file_path"])))
-        self._images = [_file(file.parent, str(frame["file_path"])) for frame in frames]
+        self._images = ImageFiles((_file(file.parent, str(frame["file_path"])) for frame in frames), path)
         self._depth = [frame.get("depth_file_path") for frame in frames]
         self._folder = file.parent
         unit = numbers(content.get("depth_unit_scale_factor", 0.001), 1)[0]
         self._scale = 1 / unit if unit > 0 else 1000.0
-        notes: list[str] = []
-        self.calibration = None
-        calibrated = _calibration(str(file), content, frames)
-        if calibrated is not None:
-            self.calibration, notes = calibrated
+        notes = list(self._images.notes)
+        self._size = _size(content, frames) or _size_of_picture(self._images)
+        if self._size is not None:
+            content = {**content, "w": self._size[0], "h": self._size[1]}
+        self.calibration = self.own_calibration(lambda: _calibration(str(file), content, frames, notes))
         rate, note = frame_rate(None, settings)
         notes += [f"{path}: {note}"] if note else []
         self.times = np.arange(len(frames)) / rate
@@ -57,21 +65,20 @@ class Nerfstudio(Recording):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        return path.name == "transforms.json" or (path / "transforms.json").is_file()
+        return path.name in _NAMES or any((path / name).is_file() for name in _NAMES)
 
     def source(self, index: int) -> str:
-        return str(self._images[index])
+        return str(self._images.files[index])
 
     def image(self, index: int) -> UInt8:
-        return read_image(self._images[index])
+        return self._images.read(index)
 
     def depth(self, index: int) -> Float32 | None:
         name = self._depth[index]
         if not name:
             return None
-        depth = read_depth(self._folder / str(name), self._scale)
-        assert self.calibration is not None
-        size = self.calibration.size
+        depth = read_depth(listed_file(self._folder, str(name)), self._scale)
+        size = self._size
         if size is not None and depth.shape != (size[1], size[0]):
             return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
         return depth
@@ -79,28 +86,50 @@ class Nerfstudio(Recording):
 
 def _file(folder: Path, name: str) -> Path:
     """The image; names without an ending mean PNG, as in NeRF's synthetic scenes."""
-    return folder / name if Path(name).suffix else folder / f"{name}.png"
+    return listed_file(folder, name if Path(name.replace("\\", "/")).suffix else f"{name}.png")
 
 
 def _calibration(
-    source: str, content: dict[str, Any], frames: list[dict[str, Any]]
-) -> tuple[Calibration, list[str]] | None:
-    """Intrinsics of all frames, those of the whole file where a frame has none; None where neither has any."""
-    size_numbers = numbers([_value(frames[0], content, "w"), _value(frames[0], content, "h")], 2)
-    size = None
-    if np.isfinite(size_numbers).all() and (size_numbers >= 1).all():
-        size = (int(size_numbers[0]), int(size_numbers[1]))
+    source: str, content: dict[str, Any], frames: list[dict[str, Any]], notes: list[str]
+) -> Calibration | None:
+    """Intrinsics of all frames, those of the whole file where a frame has none; None where neither has any.
+
+    A line is added to `notes` where they vary.
+
+    Raises:
+        InputError: a lens that is not supported, or one that changes between frames.
+    """
+    size = _size(content, frames)
     rows = np.stack([_intrinsics(frame, content, size) for frame in frames])
     if not np.isfinite(rows).all(axis=1).any():
         return None
-    model = str(content.get("camera_model", "OPENCV")).upper()
-    names = ("k1", "k2", "k3", "k4") if model == "OPENCV_FISHEYE" else ("k1", "k2", "p1", "p2", "k3")
-    if model != "OPENCV_FISHEYE" and model not in _BROWN:
-        raise InputError(f"{source}: camera_model {model} is not supported; undistort the images, or give --camera")
-    values = tuple(float(_value(frames[0], content, name) or 0.0) for name in names)
-    fisheye = model == "OPENCV_FISHEYE"
-    distortion = values if fisheye or any(values) else ()
-    return median_calibration(source, rows, distortion, "fisheye" if fisheye else "brown", size)
+    lenses = [{key: value for key, value in frame.items() if _is_lens(key)} for frame in frames]
+    if any(lens != lenses[0] for lens in lenses):
+        raise InputError(f"{source}: the distortion changes between frames; undistort the images, or give --camera")
+    usable = rows[np.isfinite(rows).all(axis=1)][0] + [0.0, 0.0, 0.5, 0.5]
+    given = {key: value for key, value in content.items() if _is_lens(key) or key in ("w", "h")} | lenses[0]
+    lens = camera_of({**given, **dict(zip(("fl_x", "fl_y", "cx", "cy"), usable.tolist(), strict=True))}, source)
+    return median_calibration(source, rows, lens.distortion, lens.distortion_model, size, notes)
+
+
+def _size(content: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[int, int] | None:
+    """Width and height of the images, None where the file does not say."""
+    values = numbers([_value(frames[0], content, "w"), _value(frames[0], content, "h")], 2)
+    return (int(values[0]), int(values[1])) if np.isfinite(values).all() and (values >= 1).all() else None
+
+
+def _size_of_picture(images: ImageFiles) -> tuple[int, int] | None:
+    """Width and height of the first picture, where the file does not say them (NeRF's synthetic scenes)."""
+    try:
+        height, width = images.read(0).shape[:2]
+    except UnreadableFrameError:
+        return None
+    return width, height
+
+
+def _is_lens(key: str) -> bool:
+    """Whether a key of the file or of a frame is about the lens; names, poses and sizes are not."""
+    return key not in _NO_LENS and not key.endswith(("_path", "_matrix"))
 
 
 def _intrinsics(frame: dict[str, Any], content: dict[str, Any], size: tuple[int, int] | None) -> Float64:

@@ -10,10 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from improvo.errors import ConfigError, InputError
+from improvo.sequences.association import poses_at
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
 from improvo.sequences.live import LiveStream, is_live
 from improvo.sequences.live_sequence import LiveSequence
-from improvo.sequences.sequence import Sequence
+from improvo.sequences.sequence import Sequence, selected
+from improvo.types import Trajectory
+from improvo.untrusted.paths import check_path
 
 ENTRY_POINT = "improvo.recordings"  # the group under which other packages offer their readers
 
@@ -31,6 +34,7 @@ FORMATS: dict[str, str] = {
     "tum": "improvo.sequences.tum_rgbd:TumRgbd",
     "euroc": "improvo.sequences.euroc:EurocMav",
     "kitti": "improvo.sequences.kitti_odometry:KittiOdometry",
+    "kitti-raw": "improvo.sequences.kitti_raw:KittiRaw",
     "video": "improvo.sequences.video_file:VideoFile",
     "images": "improvo.sequences.image_folder:ImageFolder",
 }
@@ -54,12 +58,39 @@ def open_sequence(path: Path | str, settings: SequenceSettings | None = None, **
     return Sequence(recording, settings)
 
 
+def true_trajectory(path: Path | str, settings: SequenceSettings | None = None, **overrides: Any) -> Trajectory | None:
+    """True poses at the times of the selected frames, None where the recording has none; needs no calibration.
+
+    Arguments and errors as `open_sequence`.
+    """
+    settings = _with_overrides(settings, overrides)
+    recording = open_recording(path, settings)
+    if isinstance(recording, LiveStream):
+        recording.close()
+        return None
+    times = recording.times[selected(recording, settings)]
+    return None if recording.ground_truth is None else poses_at(recording.ground_truth, times)
+
+
 def open_recording(path: Path | str, settings: SequenceSettings | None = None, **overrides: Any) -> Recording:
     """The recording as it lies on disk: raw images, needs no calibration. Arguments and errors as `open_sequence`."""
     settings = _with_overrides(settings, overrides)
-    path = Path(path)
+    path = check_path(Path(path))
     if settings.fps is not None and not settings.fps > 0:
         raise InputError(f"{path}: fps {settings.fps:g} must be positive")
+    try:
+        return _recording(path, settings)
+    except UnreadableFrameError as error:
+        raise InputError(f"{path}: {error}; copy or export the recording again") from None
+    except MemoryError:
+        raise InputError(f"{path}: needs more memory than there is; cut it into parts") from None
+    except OSError as error:
+        raise InputError(
+            f"{error.filename or path}: {error.strerror or error}; check the path and permissions"
+        ) from None
+
+
+def _recording(path: Path, settings: SequenceSettings) -> Recording:
     live = is_live(str(path))
     if not live and not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
@@ -68,19 +99,22 @@ def open_recording(path: Path | str, settings: SequenceSettings | None = None, *
     if settings.format == "auto":
         chosen = next((recording for recording in _formats() if recording.recognises(path)), None)
         if chosen is None:
+            other = _unread_pictures(path)
+            if other is not None:
+                raise InputError(f"{path}: holds {other} files, which are not read; convert them to JPEG or PNG")
             raise InputError(
                 f"{path}: not recognised as any of {', '.join(format_names())}; name it with --format if it is one"
             )
     else:
         chosen = _format(settings.format)
-    try:
-        return chosen(path, settings)
-    except UnreadableFrameError as error:
-        raise InputError(f"{path}: {error}; copy or export the recording again") from None
-    except OSError as error:
-        raise InputError(
-            f"{error.filename or path}: {error.strerror or error}; check the path and permissions"
-        ) from None
+    return chosen(path, settings)
+
+
+def _unread_pictures(path: Path) -> str | None:
+    """The kind of picture that a folder holds and that no reader reads; None without."""
+    kinds = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".jxl", ".exr", ".gif", ".raw"}
+    suffixes = {file.suffix.lower() for file in path.iterdir()} & kinds if path.is_dir() else set()
+    return next(iter(sorted(suffixes)), None)
 
 
 def format_names() -> list[str]:

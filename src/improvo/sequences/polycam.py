@@ -13,7 +13,8 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.geometry.trajectory_files import increasing_order
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.images import list_images, read_depth, read_image
+from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.images import list_images, read_depth
 from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
 from improvo.types import Float32, UInt8
 
@@ -50,12 +51,16 @@ class Polycam(Recording):
             self.times = stamps[order]
         else:
             self.times = np.arange(len(names)) / (settings.fps or FPS)
-        self._images = [images[name] for name in names]
+        self._images = ImageFiles((images[name] for name in names), path)
+        notes += self._images.notes
         self._depth = [folder / "depth" / f"{name}.png" for name in names]
         size_numbers = numbers([cameras[0].get("width"), cameras[0].get("height")], 2)
         size = (int(size_numbers[0]), int(size_numbers[1])) if (size_numbers >= 1).all() else None
         intrinsics = np.stack([numbers([c.get(key) for key in ("fx", "fy", "cx", "cy")], 4) for c in cameras])
-        self.calibration, more = median_calibration(str(folder / f"{prefix}cameras"), intrinsics, size=size)
+        more: list[str] = []
+        name = str(folder / f"{prefix}cameras")
+        self.calibration = self.own_calibration(lambda: median_calibration(name, intrinsics, size=size, notes=more))
+        self._size = size
         last_row = np.tile([[0.0, 0.0, 0.0, 1.0]], (len(names), 1))
         rows = np.stack([numbers([camera.get(key) for key in _POSE], 12) for camera in cameras])
         poses = np.concatenate([rows, last_row], axis=1).reshape(-1, 4, 4)
@@ -69,10 +74,10 @@ class Polycam(Recording):
         )
 
     def source(self, index: int) -> str:
-        return str(self._images[index])
+        return str(self._images.files[index])
 
     def image(self, index: int) -> UInt8:
-        return read_image(self._images[index])
+        return self._images.read(index)
 
     def depth(self, index: int) -> Float32 | None:
         """The depth image shows the same view at a lower resolution; each pixel looks up the nearest."""
@@ -80,7 +85,7 @@ class Polycam(Recording):
         if not file.is_file():
             return None
         depth = read_depth(file, DEPTH_SCALE)
-        size = self.calibration.size if self.calibration is not None else None
+        size = self._size
         if size is not None and depth.shape != (size[1], size[0]):
             return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
         return depth

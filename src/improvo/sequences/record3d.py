@@ -18,8 +18,9 @@ from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameE
 from improvo.sequences.images import decode, depth_in_metres, natural_key
 from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
 from improvo.types import Float32, Float64, UInt8
-
-_MAX_METADATA = 1 << 28
+from improvo.untrusted.arrays import FAULTS
+from improvo.untrusted.limits import MAX_ARRAY_BYTES, MAX_JSON_BYTES, MAX_PIXELS
+from improvo.untrusted.text import reason
 
 
 class Record3d(Recording):
@@ -33,7 +34,10 @@ class Record3d(Recording):
         name = next((name for name in ("metadata", "metadata.json") if self._files.has(name)), None)
         if name is None:
             raise InputError(f"{path}: has no metadata, so it is no Record3D export; export it again")
-        metadata = read_json(path / name, self._files.read(name, _MAX_METADATA))
+        try:
+            metadata = read_json(path / name, self._files.read(name, MAX_JSON_BYTES + 1))
+        except UnreadableFrameError as error:
+            raise InputError(f"{path}: its metadata {error}; export it again") from None
         folder = next((f for f in ("rgbd", "rgb") if self._files.list(f, (".jpg", ".png"))), None)
         if folder is None:
             raise InputError(f"{path}: has no images in rgbd or rgb; export it again")
@@ -44,10 +48,13 @@ class Record3d(Recording):
         stamped = settings.fps is None and np.isfinite(stamps).all() and (np.diff(stamps) > 0).all()
         self.times = stamps if stamped else np.arange(count) / rate
         size_numbers = numbers([metadata.get("w"), metadata.get("h")], 2)
-        size = (int(size_numbers[0]), int(size_numbers[1])) if (size_numbers >= 1).all() else None
-        self.calibration, notes = median_calibration(str(path), _intrinsics(metadata, count), size=size)
+        size = _size(size_numbers)
+        notes: list[str] = []
+        rows = _intrinsics(metadata, count)
+        self.calibration = self.own_calibration(lambda: median_calibration(str(path), rows, size=size, notes=notes))
+        self._size = size
         depth_size = numbers([metadata.get("dw"), metadata.get("dh")], 2)
-        self._depth_size = (int(depth_size[0]), int(depth_size[1])) if (depth_size >= 1).all() else None
+        self._depth_size = _size(depth_size)
         poses = _poses(metadata.get("poses"), count)
         self.ground_truth, problems = trajectory_from_opengl(str(path), self.times, poses)
         if self._files.has(self._depth_name(0, ".depth")) and _lzfse() is None:
@@ -76,7 +83,10 @@ class Record3d(Recording):
             return None
         width, height = self._depth_size
         try:
-            data = decompress(self._files.read(name))
+            packed = self._files.read(name)
+            if len(packed) > 2 * 4 * width * height + 4096:
+                raise UnreadableFrameError("has more bytes of depth than its size")
+            data = decompress(packed)
         except UnreadableFrameError:
             raise
         except Exception:  # the codec's own error type is not public
@@ -84,7 +94,7 @@ class Record3d(Recording):
         if len(data) != 4 * width * height:
             raise UnreadableFrameError(f"has {len(data)} bytes of depth, not {4 * width * height}")
         depth = depth_in_metres(np.frombuffer(data, "<f4").reshape(height, width), 1.0)
-        size = self.calibration.size if self.calibration is not None else None
+        size = self._size
         return depth if size is None else np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
 
     def _depth_name(self, index: int, ending: str) -> str:
@@ -105,7 +115,7 @@ class _Folder:
         names = [f"{folder}/{file.name}" for file in files if file.name.lower().endswith(endings)]
         return sorted(names, key=natural_key)
 
-    def read(self, name: str, limit: int = 1 << 30) -> bytes:
+    def read(self, name: str, limit: int = MAX_ARRAY_BYTES) -> bytes:
         try:
             with (self._path / name).open("rb") as file:
                 return file.read(limit)
@@ -119,8 +129,8 @@ class _Archive:
     def __init__(self, path: Path) -> None:
         try:
             self._zip = zipfile.ZipFile(path)
-        except (OSError, zipfile.BadZipFile) as error:
-            raise InputError(f"{path}: is no complete .r3d archive ({error}); export it again") from None
+        except FAULTS as error:
+            raise InputError(f"{path}: is no complete .r3d archive ({reason(error)}); export it again") from None
         self._names = set(self._zip.namelist())
 
     def has(self, name: str) -> bool:
@@ -130,22 +140,12 @@ class _Archive:
         names = [n for n in self._names if n.startswith(f"{folder}/") and n.lower().endswith(endings)]
         return sorted(names, key=natural_key)
 
-    def read(self, name: str, limit: int = 1 << 30) -> bytes:
+    def read(self, name: str, limit: int = MAX_ARRAY_BYTES) -> bytes:
         try:
             with self._zip.open(name) as file:
                 return file.read(limit)
-        except (
-            OSError,
-            KeyError,
-            zipfile.BadZipFile,
-            NotImplementedError,
-            RuntimeError,
-            EOFError,
-            ValueError,
-        ) as error:
-            raise UnreadableFrameError(f"cannot be unpacked ({error})") from None
-        except Exception as error:  # zlib.error and what other decompressors raise
-            raise UnreadableFrameError(f"cannot be unpacked ({error})") from None
+        except Exception as error:  # of many kinds: zip's own, and what its decompressors raise
+            raise UnreadableFrameError(f"cannot be unpacked ({reason(error)})") from None
 
 
 def _intrinsics(metadata: dict[str, Any], count: int) -> Float64:
@@ -167,6 +167,13 @@ def _poses(rows: Any, count: int) -> Float64:
         if np.isfinite(values).all() and np.linalg.norm(values[:4]) > 1e-6:
             poses[i] = rigid(rotation_from_quat_xyzw(values[:4]), values[4:])
     return poses
+
+
+def _size(sides: Float64) -> tuple[int, int] | None:
+    """Width and height; None where they cannot be."""
+    if not ((sides >= 1) & (sides <= MAX_PIXELS)).all() or sides.prod() > MAX_PIXELS:
+        return None
+    return int(sides[0]), int(sides[1])
 
 
 def _positive(value: Any) -> float | None:

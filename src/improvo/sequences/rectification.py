@@ -11,6 +11,8 @@ from improvo.errors import InputError
 from improvo.geometry.camera import Camera
 from improvo.types import Float32, Float64, UInt8
 
+MAX_FOV = 120.0  # degrees of the wider side, where nothing else is asked for
+SMALLEST_CAP = 90.0  # degrees that a view is never narrowed below to keep the middle's resolution
 _ZOOM_LIMITS = (1 / 64, 8.0)
 
 
@@ -18,16 +20,30 @@ class Rectifier:
     """Carries raw images and depth of one camera to a pinhole camera of the same or another width.
 
     A distorted camera gets the widest pinhole view of the raw size, pixel shape and principal point that shows no
-    border: its focal lengths are the raw ones times `zoom`. What the view leaves out is said by `description`.
+    border: its focal lengths are the raw ones times `zoom`. A pinhole that is wider than `MAX_FOV` would shrink its
+    middle to nothing, so beyond that the view keeps the focal length of the middle. What it leaves out is said by
+    `description`.
+
+    Args:
+        raw: the camera of the recording's images.
+        width: of the delivered frames in pixels; None is that of the recording.
+        fov: degrees that the wider side of the undistorted view shall see, as far as the picture goes.
+
+    Raises:
+        InputError: a distortion that cannot be undone, or an angle that no pinhole has.
     """
 
-    def __init__(self, raw: Camera, width: int | None = None) -> None:
+    def __init__(self, raw: Camera, width: int | None = None, fov: float | None = None) -> None:
+        if fov is not None and not 1.0 <= fov < 179.0:
+            raise InputError(f"--undistorted-fov {fov:g}: must be between 1 and 179 degrees")
         self.raw = raw
         self.zoom = 1.0
+        self._widest = 1.0
         self._maps: tuple[Float32, Float32] | None = None
         view = raw.pinhole()
         if not raw.is_pinhole:
-            self.zoom = _widest_zoom(raw)
+            self._widest = _widest_zoom(raw)
+            self.zoom = _chosen_zoom(raw, self._widest, fov)
             view = replace(view, fx=raw.fx * self.zoom, fy=raw.fy * self.zoom)
             self._maps = _maps(raw, view)
         self._undistorted = view
@@ -44,19 +60,21 @@ class Rectifier:
                 f"undistorted ({self.raw.distortion_model}) to a {self._undistorted.width}x{self._undistorted.height} "
                 f"pinhole, focal length x {self.zoom:.3f}, {100 * self._share_kept():.0f} % of the raw picture kept"
             )
+            if self.zoom > 1.001 * self._widest:
+                parts[-1] += f" (--undistorted-fov shows up to {_fov(self.raw, self._widest):.0f} degrees)"
         if (self.camera.width, self.camera.height) != (self.raw.width, self.raw.height):
             parts.append(f"resized to {self.camera.width}x{self.camera.height}")
         return ", ".join(parts) or "as recorded"
 
-    def image(self, grey: UInt8) -> UInt8:
-        """Raw grey (H, W) -> delivered grey; sampling bilinear, shrinking by pixel area."""
+    def image(self, image: UInt8) -> UInt8:
+        """Raw image (H, W) or (H, W, C) -> delivered; sampling bilinear, shrinking by pixel area."""
         if self._maps is not None:
-            grey = cv2.remap(grey, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            image = cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         size = (self.camera.width, self.camera.height)
-        if size != (grey.shape[1], grey.shape[0]):
-            shrinks = size[0] < grey.shape[1]
-            grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-        return np.ascontiguousarray(grey)
+        if size != (image.shape[1], image.shape[0]):
+            shrinks = size[0] < image.shape[1]
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        return np.ascontiguousarray(image)
 
     def depth(self, depth: Float32) -> Float32:
         """Raw depth (H, W) -> depth of the delivered frame by nearest pixel, so that edges are not mixed."""
@@ -91,6 +109,24 @@ def _widest_zoom(raw: Camera) -> float:
         middle = 0.5 * (low + high)
         low, high = (low, middle) if _inside(raw, middle, border) else (middle, high)
     return high
+
+
+def _chosen_zoom(raw: Camera, widest: float, fov: float | None) -> float:
+    """The factor on the focal lengths: the widest, unless that shows more than was asked for or than can be seen."""
+    if fov is not None:
+        return max(widest, _zoom_for(raw, fov))
+    if _fov(raw, widest) <= MAX_FOV:
+        return widest
+    return max(widest, min(1.0, _zoom_for(raw, SMALLEST_CAP)), _zoom_for(raw, MAX_FOV))
+
+
+def _fov(raw: Camera, zoom: float) -> float:
+    """Degrees that the wider side of a pinhole view sees."""
+    return float(2 * np.degrees(np.arctan(max(raw.width / raw.fx, raw.height / raw.fy) / (2 * zoom))))
+
+
+def _zoom_for(raw: Camera, fov: float) -> float:
+    return float(max(raw.width / raw.fx, raw.height / raw.fy) / (2 * np.tan(np.radians(fov) / 2)))
 
 
 def _inside(raw: Camera, zoom: float, border: Float64) -> bool:

@@ -19,7 +19,8 @@ from improvo.geometry.camera_files import Calibration
 from improvo.geometry.trajectory_files import increasing_order
 from improvo.sequences import ros_messages
 from improvo.sequences.association import nearest
-from improvo.sequences.base import Recording, SequenceSettings
+from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
+from improvo.sequences.grey_levels import SAMPLES, Stretch, stretch_of, to_8_bits
 from improvo.sequences.ros_topics import Stream, candidates, deserialized, guarded, open_reader
 from improvo.types import Float32, Int64, Trajectory, UInt8
 
@@ -50,8 +51,10 @@ class RosBag(Recording):
         order, repeated = increasing_order(stamps)
         notes += [f"{path}: {repeated} images repeat a time stamp and were left out"] if repeated else []
         self._rows, self.times = order, stamps[order]
-        self.calibration = _camera_info(self._reader, self._images.topic, path)
+        self.calibration = self.own_calibration(lambda: _camera_info(self._reader, self._images.topic, path))
         self._depths = depths
+        self._stretch = self._common_stretch()
+        notes += [f"{path}: {self._stretch.note}"] if self._stretch is not None else []
         self._notes = notes
 
     @property
@@ -86,7 +89,22 @@ class RosBag(Recording):
         return f"{self.path}#{self._images.topic}/{index}"
 
     def image(self, index: int) -> UInt8:
+        return to_8_bits(self._picture(index), self._stretch)
+
+    def _picture(self, index: int) -> np.ndarray:
         return ros_messages.image(self._images.message(int(self._rows[index])))
+
+    def _common_stretch(self) -> Stretch | None:
+        """The range of deep pictures; read from a few of them, where the first is deep."""
+        pictures = []
+        for row in np.unique(np.linspace(0, len(self.times) - 1, min(SAMPLES, len(self.times))).astype(int)).tolist():
+            try:
+                pictures.append(self._picture(row))
+            except UnreadableFrameError:  # any message may be damaged
+                continue
+            if pictures[-1].dtype == np.uint8:
+                return None
+        return stretch_of(pictures)
 
     def depth(self, index: int) -> Float32 | None:
         if self._depth is None:
@@ -124,14 +142,19 @@ def _choose(pictures: list[Stream], topic: str | None, path: Path) -> Stream:
             if stream.topic == topic or stream.topic.lstrip("/") == topic.lstrip("/"):
                 return stream
     if not pictures or topic is not None:
-        known = ", ".join(stream.topic for stream in pictures) or "none"
+        known = ", ".join(stream.topic for stream in pictures) or "none (depth alone cannot be tracked)"
         wanted = f"no image topic {topic}" if topic else "no image topic"
         raise InputError(f"{path}: has {wanted}; topics with pictures: {known}")
 
     def rank(stream: Stream) -> tuple[bool, bool, bool, str]:
-        name = stream.topic
+        name = stream.topic.lower()
         # colour before infrared, left before right, the raw stream before its compressed or rectified copies
-        return ("infra" in name or "/ir/" in name, "right" in name, "compressed" in name or "rect" in name, name)
+        return (
+            "infra" in name or "/ir/" in name,
+            "right" in name,
+            "compressed" in name or "rect" in name,
+            stream.topic,
+        )
 
     return min(pictures, key=rank)
 
@@ -140,7 +163,8 @@ def _camera_info(reader: Any, topic: str, path: Path) -> Calibration | None:
     """The CameraInfo beside an image topic, else the only one of the bag."""
     infos = [c for c in reader.connections if c.msgtype == "sensor_msgs/msg/CameraInfo" and c.msgcount]
     parents = [topic.rsplit("/", depth)[0] for depth in (1, 2, 3) if topic.count("/") >= depth]
-    beside = next((c for parent in parents for c in infos if c.topic == f"{parent}/camera_info"), None)
+    names = [f"{parent}{name}" for parent in parents for name in ("/camera_info", "/info/camera_info")]
+    beside = next((c for name in names for c in infos if c.topic == name), None)
     chosen = beside or (infos[0] if len(infos) == 1 else None)
     if chosen is None:
         return None

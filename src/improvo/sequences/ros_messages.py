@@ -8,12 +8,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from improvo.errors import InputError
-from improvo.geometry.camera_files import MODEL_NAMES, Calibration, usual_length
+from improvo.geometry.camera_files import Calibration, camera_of
+from improvo.geometry.camera_files.distortion import MODEL_NAMES, normalised
 from improvo.geometry.se3 import rigid, rotation_from_quat_xyzw
 from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.images import decode, depth_in_metres
-from improvo.types import Float32, Float64, UInt8
+from improvo.types import Float32, Float64
 
 # encoding -> dtype, channels, conversion to grey or BGR
 _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
@@ -53,18 +53,16 @@ def header_stamp(data: bytes, ros2: bool) -> int:
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
-def image(message: Any) -> UInt8:
-    """The picture of an Image or CompressedImage, (H, W) grey or (H, W, 3) BGR.
+def image(message: Any) -> np.ndarray:
+    """The picture of an Image or CompressedImage, (H, W) grey or (H, W, 3) BGR, 8 or 16 bits.
 
     Raises:
         UnreadableFrameError: an encoding that is not known, or fewer bytes than the header says.
     """
     if _is_compressed(message):
-        return decode(bytes(message.data), cv2.IMREAD_ANYCOLOR).astype(np.uint8, copy=False)
+        return decode(bytes(message.data), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     pixels, conversion = _pixels(message)
-    if pixels.dtype == np.uint16:
-        pixels = (pixels >> 8).astype(np.uint8)
-    elif pixels.dtype != np.uint8:
+    if pixels.dtype not in (np.uint8, np.uint16):
         raise UnreadableFrameError(f"encoding {message.encoding} is no picture; choose another --topic")
     return np.ascontiguousarray(pixels) if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
 
@@ -94,9 +92,9 @@ def depth(message: Any) -> Float32:
 def is_depth(message: Any, topic: str) -> bool:
     """Whether an image message holds depth rather than a picture."""
     if _is_compressed(message):
-        return "compressedDepth" in message.format or ("16UC1" in message.format and "depth" in topic)
+        return "compressedDepth" in message.format or ("16UC1" in message.format and "depth" in topic.lower())
     if message.encoding == "mono16":
-        return "depth" in topic
+        return "depth" in topic.lower()
     return message.encoding in _DEPTH_ENCODINGS
 
 
@@ -107,23 +105,24 @@ def calibration(message: Any, source: str, rectified: bool) -> Calibration | Non
         message: sensor_msgs/CameraInfo.
         source: for messages.
         rectified: the images are those of `image_rect`, whose camera is P, without distortion.
+
+    Raises:
+        InputError: a distortion that is not supported, or numbers that cannot be.
     """
     matrix = np.asarray(_field(message, "K"), np.float64).reshape(3, 3)
-    distortion = tuple(float(value) for value in _field(message, "D"))
-    model = MODEL_NAMES.get(str(message.distortion_model).lower())
-    if model is None:
-        raise InputError(f"{source}: distortion model {message.distortion_model} is not supported; give --camera")
+    distortion = [float(value) for value in _field(message, "D")]
+    content: dict[str, Any] = {"distortion_model": str(message.distortion_model), "D": distortion}
     if rectified:
-        matrix, distortion = np.asarray(_field(message, "P"), np.float64).reshape(3, 4)[:, :3], ()
+        matrix, content = np.asarray(_field(message, "P"), np.float64).reshape(3, 4)[:, :3], {}
     if not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
         return None
-    size = (int(message.width), int(message.height)) if message.width and message.height else None
-    intrinsics = (float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]))
-    if not any(distortion) and model != "fisheye":
-        distortion, model = (), "brown"
-    result = Calibration(source, intrinsics, usual_length(distortion, model), model, size)
-    result.camera(*(size or (1, 1)))
-    return result
+    if "D" in content and not any(distortion) and MODEL_NAMES.get(normalised(content["distortion_model"])) != "fisheye":
+        content = {}
+    roi = getattr(message, "roi", None)
+    names = ("x_offset", "y_offset", "height", "width") if roi is not None else ()
+    content |= {f"roi_{name}": int(getattr(roi, name)) for name in names}
+    content |= {name: int(getattr(message, name, 0)) for name in ("binning_x", "binning_y", "width", "height")}
+    return camera_of({"K": matrix.tolist(), **content}, source)
 
 
 def pose(message: Any) -> Float64:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +16,7 @@ from improvo.errors import InputError, MissingExtraError
 from improvo.sequences import ros_messages
 from improvo.sequences.base import UnreadableFrameError
 from improvo.types import Float64, Int64
+from improvo.untrusted.decompression import decompress
 
 _IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _SAMPLES = 16  # messages whose header stamps are compared with the bag's
@@ -30,6 +34,7 @@ def open_reader(path: Path) -> Any:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise MissingExtraError("reading ROS bags", "ros") from None
+    _bound_decompressors()
     try:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
@@ -41,6 +46,26 @@ def open_reader(path: Path) -> Any:
     return reader
 
 
+def _bound_decompressors() -> None:
+    """Let rosbags unpack no chunk to more than our limit: a few kilobytes of bz2 can become gigabytes.
+
+    A version that keeps its decompressors elsewhere does as before.
+    """
+    import bz2
+    from importlib import import_module
+
+    with suppress(ImportError, AttributeError):
+        lz4 = partial(decompress, import_module("lz4.frame").LZ4FrameDecompressor)
+        first: Any = import_module("rosbags.rosbag1.reader")
+        second: Any = import_module("rosbags.rosbag2.reader")
+        mcap: Any = import_module("rosbags.rosbag2.storage_mcap")
+        first.decompressors.update(bz2=partial(decompress, bz2.BZ2Decompressor), lz4=lz4)
+        if isinstance(second.zstd, ModuleType):
+            zstd = partial(decompress, second.zstd.ZstdDecompressor)
+            mcap.DECOMPRESSORS.update(lz4=lambda data, _: lz4(data), zstd=lambda data, _: zstd(data))
+            second.zstd = SimpleNamespace(open=second.zstd.open, compress=second.zstd.compress, decompress=zstd)
+
+
 def candidates(reader: Any, path: Path) -> tuple[list[Stream], list[Stream]]:
     """The streams with pictures and those with depth, told apart by their first message.
 
@@ -49,6 +74,8 @@ def candidates(reader: Any, path: Path) -> tuple[list[Stream], list[Stream]]:
     """
     pictures: list[Stream] = []
     depths: list[Stream] = []
+    if not all(isinstance(c.topic, str) and isinstance(c.msgtype, str) for c in reader.connections):
+        raise InputError(f"{path}: its metadata names topics that are no words; run `ros2 bag reindex` on it")
     for topic in sorted({c.topic for c in reader.connections if c.msgtype in _IMAGE_TYPES and c.msgcount}):
         connections = [c for c in reader.connections if c.topic == topic and c.msgtype in _IMAGE_TYPES]
         stream = Stream(reader, topic, connections, path)

@@ -13,12 +13,16 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
 from improvo.geometry.camera_files import Calibration, folder_calibration
+from improvo.geometry.camera_files.calibration import checked
+from improvo.geometry.text_files import decoded, read_text
 from improvo.geometry.trajectory_files import clean_poses
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_folder import frame_rate
-from improvo.sequences.images import list_images, read_depth, read_image
+from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.images import list_images, read_depth
+from improvo.sequences.rates import frame_rate
 from improvo.sequences.registration import intrinsics_of, register_depth, relative_extrinsics
 from improvo.types import Float32, Float64, Trajectory, UInt8
+from improvo.untrusted.names import number_of
 
 DEPTH_SCALE = 1000.0
 FPS = 30.0
@@ -35,22 +39,27 @@ class ScanNetFolder(Recording):
         self._depth_intrinsics: tuple[float, float, float, float] | None = None
         self._extrinsics = (np.eye(4), np.eye(4))
         info = _info_file(path)
-        self._images = _numbered(path) if info is not None else list_images(path / "color")
-        if not self._images:
+        files = _numbered(path) if info is not None else list_images(path / "color")
+        self._images = ImageFiles(files, path)
+        self.notes = tuple(self._images.notes)
+        if not files:
             raise InputError(f"{path}: has no colour images; export the scene again")
         if info is not None:
             self._read_info(info)
-            stems = [file.name.split(".")[0] for file in self._images]
+            stems = [file.name.split(".")[0] for file in files]
             self._depth = [_first(path / f"{stem}.depth.png", path / f"{stem}.depth.pgm") for stem in stems]
             poses_files = [path / f"{stem}.pose.txt" for stem in stems]
             numbers = np.array([int(stem.split("-")[1]) for stem in stems], np.float64)
         else:
             self._read_intrinsics(path / "intrinsic")
-            stems = [file.stem for file in self._images]
+            stems = [file.stem for file in files]
             self._depth = [path / "depth" / f"{stem}.png" for stem in stems]
             poses_files = [path / "pose" / f"{stem}.txt" for stem in stems]
             numbers = np.array([int(stem) if stem.isdigit() else row for row, stem in enumerate(stems)], np.float64)
-        self.calibration = folder_calibration(path) or self.calibration
+        published = self.calibration
+        self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: published)
+        if self.calibration is not None:
+            self.calibration_error = None
         given = settings.fps or settings.camera or (self.calibration and self.calibration.fps)
         self.times = (numbers - numbers[0]) / (frame_rate(self.calibration, settings)[0] if given else FPS)
         if len(self.times) > 1 and not (np.diff(self.times) > 0).all():
@@ -60,7 +69,7 @@ class ScanNetFolder(Recording):
         bad = [r for r in np.union1d(not_finite, not_rigid).tolist() if poses_files[r].is_file()]
         if bad:
             named = ", ".join(poses_files[row].name for row in bad[:5]) + (", ..." if len(bad) > 5 else "")
-            self.notes = (f"{path}: {len(bad)} pose files hold no rigid pose ({named})",)
+            self.notes = (*self.notes, f"{path}: {len(bad)} pose files hold no rigid pose ({named})")
         if np.isfinite(poses).any():
             self.ground_truth = Trajectory(self.times, poses @ self._extrinsics[0])
 
@@ -72,10 +81,10 @@ class ScanNetFolder(Recording):
         return exported or _info_file(path) is not None
 
     def source(self, index: int) -> str:
-        return str(self._images[index])
+        return str(self._images.files[index])
 
     def image(self, index: int) -> UInt8:
-        return read_image(self._images[index])
+        return self._images.read(index)
 
     def depth(self, index: int) -> Float32 | None:
         file = self._depth[index]
@@ -92,10 +101,9 @@ class ScanNetFolder(Recording):
         """`intrinsic_color.txt` and its three companions."""
         colour = read_matrix(folder / "intrinsic_color.txt")
         if np.isfinite(colour).all():
-            height, width = read_image(self._images[0]).shape[:2]
-            self.calibration = Calibration(
-                str(folder / "intrinsic_color.txt"), intrinsics_of(colour), size=(width, height)
-            )
+            height, width = self._images.read(0).shape[:2]
+            published = Calibration(str(folder / "intrinsic_color.txt"), intrinsics_of(colour), size=(width, height))
+            self.calibration = self.own_calibration(lambda: checked(published))
         depth = read_matrix(folder / "intrinsic_depth.txt")
         if np.isfinite(depth).all() and min(depth[0, 0], depth[1, 1]) > 0:
             self._depth_intrinsics = intrinsics_of(depth)
@@ -104,15 +112,18 @@ class ScanNetFolder(Recording):
 
     def _read_info(self, info: Path) -> None:
         """`name = values` lines, as the C++ exporter writes them."""
-        lines = info.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = read_text(info, "a description of a scene").splitlines()
         values = {name.strip(): text.split() for name, _, text in (line.partition("=") for line in lines)}
         colour = _matrix(values.get("m_calibrationColorIntrinsic"))
-        if not np.isfinite(colour).all():
-            raise InputError(f"{info}: has no m_calibrationColorIntrinsic with 16 numbers; export the scene again")
         width, height = (_number(values.get(f"m_color{side}"), 0) for side in ("Width", "Height"))
         size = (int(width), int(height)) if width >= 1 and height >= 1 else None
-        self.calibration = Calibration(str(info), intrinsics_of(colour), size=size)
-        self.calibration.camera(*(size or (1, 1)))
+
+        def published() -> Calibration:
+            if not np.isfinite(colour).all():
+                raise InputError(f"{info}: has no m_calibrationColorIntrinsic with 16 numbers; export the scene again")
+            return checked(Calibration(str(info), intrinsics_of(colour), size=size))
+
+        self.calibration = self.own_calibration(published)
         depth = _matrix(values.get("m_calibrationDepthIntrinsic"))
         if np.isfinite(depth).all() and min(depth[0, 0], depth[1, 1]) > 0:
             self._depth_intrinsics = intrinsics_of(depth)
@@ -125,7 +136,7 @@ class ScanNetFolder(Recording):
 def read_matrix(path: Path) -> Float64:
     """(4, 4) from a text file, NaN if there is none or it holds anything else."""
     try:
-        return _matrix(path.read_text(encoding="utf-8").split())
+        return _matrix(decoded(path.read_bytes()).replace(",", " ").split())
     except (OSError, UnicodeDecodeError):
         return np.full((4, 4), np.nan)
 
@@ -153,7 +164,8 @@ def _info_file(path: Path) -> Path | None:
 
 
 def _numbered(path: Path) -> list[Path]:
-    return [file for file in list_images(path) if ".color." in file.name and file.name.split(".")[0][6:].isdigit()]
+    pictures = [file for file in list_images(path) if ".color." in file.name]
+    return [file for file in pictures if number_of(file.name.split(".")[0][6:]) is not None]
 
 
 def _first(*files: Path) -> Path | None:

@@ -18,11 +18,14 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
 from improvo.geometry.camera_files import Calibration
+from improvo.geometry.camera_files.calibration import checked
 from improvo.geometry.trajectory_files import clean_poses
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
 from improvo.sequences.images import decode, depth_in_metres
 from improvo.sequences.registration import intrinsics_of, register_depth, relative_extrinsics
 from improvo.types import Float32, Int64, Trajectory, UInt8
+from improvo.untrusted.decompression import decompress
+from improvo.untrusted.limits import MAX_PICTURE_BYTES
 
 FPS = 30.0
 _FRAME = struct.Struct("<16f4Q")  # camera-to-world, colour and depth time, colour and depth bytes
@@ -31,6 +34,7 @@ _SIZES = struct.Struct("<2i4IfQ")  # compressions, colour and depth sizes, depth
 _COLOUR = {0: "raw", 1: "png", 2: "jpeg"}
 _DEPTH = {0: "raw", 1: "zlib"}
 _MAX_SIDE = 16384
+_DEFLATED = 1100  # bytes that one byte of zlib can become, at most
 
 
 class ScanNetSens(Recording):
@@ -91,20 +95,25 @@ class ScanNetSens(Recording):
             return None
         data = self._bytes(int(self._offsets[index] + self._colour_bytes[index]), size)
         expected = 2 * self._depth_camera.width * self._depth_camera.height
+        if expected > _DEFLATED * size:
+            raise UnreadableFrameError(f"has {size} bytes for {expected} bytes of depth")
         if self._depth_compression == "zlib":
             try:
-                data = zlib.decompressobj().decompress(data, expected + 1)
-            except zlib.error:
+                data = decompress(zlib.decompressobj, data, expected)
+            except (zlib.error, ValueError):
                 raise UnreadableFrameError("the depth cannot be decompressed") from None
         if len(data) != expected:
             raise UnreadableFrameError(f"has {len(data)} bytes of depth, not {expected}")
         values = np.frombuffer(data, "<u2").reshape(self._depth_camera.height, self._depth_camera.width)
         own = depth_in_metres(values, self._depth_scale)
-        assert self.calibration is not None
+        if self.calibration is None:
+            return own if own.shape == self._colour_size[::-1] else None
         camera = self.calibration.camera(*self._colour_size)
         return register_depth(own, self._depth_camera, camera.pinhole(), self._colour_from_depth)
 
     def _bytes(self, offset: int, count: int) -> bytes:
+        if count > MAX_PICTURE_BYTES:
+            raise UnreadableFrameError(f"has {count} bytes, too many for a picture")
         self._file.seek(offset)
         data = self._file.read(count)
         if len(data) != count:
@@ -132,8 +141,8 @@ class ScanNetSens(Recording):
         self._colour_compression, self._depth_compression = _COLOUR[colour_kind], _DEPTH.get(depth_kind)
         self._colour_size = (sizes[0], sizes[1])
         self._depth_scale = scale if np.isfinite(scale) and scale > 0 else 1000.0
-        self.calibration = Calibration(str(self.path), intrinsics_of(intrinsic_colour), size=self._colour_size)
-        self.calibration.camera(*self._colour_size)
+        published = Calibration(str(self.path), intrinsics_of(intrinsic_colour), size=self._colour_size)
+        self.calibration = self.own_calibration(lambda: checked(published))
         self._depth_camera: Camera | None = None
         usable = min(intrinsic_depth[0, 0], intrinsic_depth[1, 1]) > 0 and np.isfinite(intrinsic_depth).all()
         if sizes[2] and sizes[3] and usable:

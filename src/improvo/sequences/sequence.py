@@ -15,8 +15,9 @@ from improvo.geometry.camera_files import Calibration, from_field_of_view, load_
 from improvo.sequences.association import poses_at
 from improvo.sequences.base import Recording, SequenceSettings, SkippedFrame, UnreadableFrameError
 from improvo.sequences.images import grey
+from improvo.sequences.mask import SequenceMasks
 from improvo.sequences.rectification import Rectifier
-from improvo.types import Float32, Float64, Frame, Int64, Trajectory, UInt8
+from improvo.types import Float32, Float64, Frame, Int64, Mask, Trajectory, UInt8
 
 _PROBES = 20  # frames tried for the image size before a recording counts as unreadable
 
@@ -33,7 +34,7 @@ class Sequence:
     """
 
     def __init__(self, recording: Recording, settings: SequenceSettings) -> None:
-        self.indices = _selected(recording, settings)  # (N,) rows of the recording
+        self.indices = selected(recording, settings)  # (N,) rows of the recording
         height, width = _probe(recording, self.indices).shape[:2]
         self._set_up(recording, settings, width, height)
 
@@ -49,7 +50,8 @@ class Sequence:
         if settings.width is not None and settings.width < 8:
             raise InputError(f"{self.path}: width {settings.width} is too small; choose at least 8 pixels")
         calibration = _calibration(recording, settings, width, height)
-        self._rectifier = Rectifier(calibration.camera(width, height), settings.width)
+        self._rectifier = Rectifier(calibration.camera(width, height), settings.width, settings.undistorted_fov)
+        self._masks = SequenceMasks(settings.mask, recording, self.name, self._rectifier) if settings.mask else None
 
     @property
     def camera(self) -> Camera:
@@ -64,12 +66,16 @@ class Sequence:
     @property
     def view(self) -> str:
         """What was done to the images, for a person: undistortion with its crop, resize."""
-        return self._rectifier.description
+        description = self._rectifier.description
+        return description if self._masks is None else f"{description}, {self._masks.description}"
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What was odd in the recording but could be handled, one line each."""
-        return self.recording.notes
+        error = self.recording.calibration_error
+        given = "--camera" if self.settings.camera is not None else "--fov"
+        left_out = () if error is None else (f"its own calibration is left out for {given} ({_first_part(error)})",)
+        return (*self.recording.notes, *left_out)
 
     @property
     def skipped(self) -> list[SkippedFrame]:
@@ -146,6 +152,13 @@ class Sequence:
         colourless = raw.ndim == 2 or raw.shape[2] == 1
         return self._rectifier.image(cv2.cvtColor(grey(raw), cv2.COLOR_GRAY2BGR) if colourless else raw[..., :3])
 
+    def mask(self, i: int) -> Mask | None:
+        """Where keypoints may be in the i-th selected frame (H, W); None is everywhere."""
+        return self._mask(int(self.indices[i]))
+
+    def _mask(self, index: int) -> Mask | None:
+        return None if self._masks is None else self._masks[index]
+
     def _frame(self, index: int) -> Frame | None:
         source = self.recording.source(index)
         try:
@@ -153,7 +166,7 @@ class Sequence:
         except UnreadableFrameError as error:
             self._skipped[index] = SkippedFrame(index, source, str(error))
             return None
-        return Frame(index, float(self.recording.times[index]), self._rectifier.image(image), source)
+        return Frame(index, float(self.recording.times[index]), self._rectifier.image(image), source, self._mask(index))
 
     def _raw_image(self, index: int) -> UInt8:
         image = self.recording.image(index)
@@ -182,7 +195,7 @@ def _image_or_reason(recording: Recording, index: int) -> tuple[UInt8 | None, st
         return None, str(error)
 
 
-def _selected(recording: Recording, settings: SequenceSettings) -> Int64:
+def selected(recording: Recording, settings: SequenceSettings) -> Int64:
     """The recording's rows that the settings ask for.
 
     Raises:
@@ -210,12 +223,19 @@ def _calibration(recording: Recording, settings: SequenceSettings, width: int, h
         return load_calibration(settings.camera)
     if settings.fov is not None:
         return from_field_of_view(settings.fov, width, height)
+    if recording.calibration_error is not None:
+        raise recording.calibration_error
     if recording.calibration is None:
         raise InputError(
             f"{recording.path}: has no calibration; give --camera FILE.yaml or fx,fy,cx,cy[,k1,k2,p1,p2,k3], "
             f"or roughly --fov DEGREES (horizontal; 60 to 75 for most phones and webcams)"
         )
     return recording.calibration
+
+
+def _first_part(error: InputError) -> str:
+    """What is wrong, without the advice."""
+    return str(error).split(";")[0]
 
 
 def _name(path: Path) -> str:

@@ -16,8 +16,9 @@ from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, folder_calibration
 from improvo.geometry.trajectory_files import clean_poses
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_folder import frame_rate
-from improvo.sequences.images import IMAGE_SUFFIXES, read_depth, read_image
+from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.images import IMAGE_SUFFIXES, read_depth
+from improvo.sequences.rates import depth_scale, frame_rate
 from improvo.sequences.scannet_folder import read_matrix
 from improvo.types import Float32, Trajectory, UInt8
 
@@ -37,20 +38,18 @@ class SevenScenes(Recording):
         if not found:
             raise InputError(f"{path}: has no frame-NNNNNN.color.png files, so it is no 7-Scenes sequence")
         self._numbers = sorted(found)
-        self._images = [found[number] for number in self._numbers]
-        self.calibration = folder_calibration(path)
-        notes: list[str] = []
+        self._images = ImageFiles((found[number] for number in self._numbers), path)
+        self.calibration = self.own_calibration(lambda: folder_calibration(path))
+        notes = list(self._images.notes)
         has_depth = any(self._beside(row, "depth.png").is_file() for row in range(min(len(self._images), 10)))
-        if self.calibration is None:
+        if self.calibration is None and self.calibration_error is None:
             self.calibration = Calibration("7-Scenes default", (525.0, 525.0, 319.5, 239.5), size=(640, 480))
             notes.append(f"{path}: has no camera.yaml; a Kinect's usual focal length of 525 px assumed")
             if has_depth:
                 notes.append(f"{path}: original 7-Scenes depth is not registered to colour: do not trust it at edges")
-        self._scale = self.calibration.depth_scale or DEPTH_SCALE
-        if settings.fps is None and settings.camera is None and self.calibration.fps is None:
-            rate = FPS
-        else:
-            rate, _ = frame_rate(self.calibration, settings)
+        self._scale = depth_scale(self.calibration, settings) or DEPTH_SCALE
+        rate, assumed = frame_rate(self.calibration, settings)
+        rate = FPS if assumed else rate
         self.times = (np.array(self._numbers, np.float64) - self._numbers[0]) / rate
         self.ground_truth, problems = self._read_poses()
         self.notes = (*notes, *problems)
@@ -60,17 +59,17 @@ class SevenScenes(Recording):
         return path.is_dir() and next(_colour_files(path), None) is not None
 
     def source(self, index: int) -> str:
-        return str(self._images[index])
+        return str(self._images.files[index])
 
     def image(self, index: int) -> UInt8:
-        return read_image(self._images[index])
+        return self._images.read(index)
 
     def depth(self, index: int) -> Float32 | None:
         file = self._beside(index, "depth.png")
         return read_depth(file, self._scale) if file.is_file() else None
 
     def _beside(self, index: int, ending: str) -> Path:
-        image = self._images[index]
+        image = self._images.files[index]
         return image.with_name(f"{image.name.split('.')[0]}.{ending}")
 
     def _read_poses(self) -> tuple[Trajectory | None, list[str]]:

@@ -13,13 +13,18 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, folder_calibration
+from improvo.geometry.text_files import read_text
+from improvo.geometry.time_units import in_seconds
 from improvo.geometry.trajectory_files import increasing_order, read_trajectory_report
 from improvo.sequences.association import nearest
 from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.images import read_depth, read_image
+from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.images import listed_file, read_depth
+from improvo.sequences.rates import depth_scale
 from improvo.types import Float32, Float64, UInt8
 
 DEPTH_SCALE = 5000.0
+_DECIMAL_COMMA = re.compile(r"^(\s*\d+),(\d+)(?=[\s;]+\S)")  # of a time stamp before a separated file name
 _PUBLISHED = {  # the data set's page, "Intrinsic Camera Calibration of the Kinect"
     "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
@@ -35,9 +40,9 @@ class TumRgbd(Recording):
     def __init__(self, path: Path, settings: SequenceSettings) -> None:
         self.path = path
         pairs = None if (path / "rgb.txt").is_file() else _pairs_file(path)
-        self.times, self._images, notes = _read_list(pairs or path / "rgb.txt", "rgb")
-        self.calibration = folder_calibration(path) or _published(path)
-        self._scale = (self.calibration and self.calibration.depth_scale) or DEPTH_SCALE
+        self.times, files, notes = _read_list(pairs or path / "rgb.txt", "rgb")
+        self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: _published(path))
+        self._scale = depth_scale(self.calibration, settings) or DEPTH_SCALE
         self._depth: list[Path] = []
         self._depth_row = np.full(len(self.times), -1, np.int64)
         if pairs is not None or (path / "depth.txt").is_file():
@@ -50,17 +55,18 @@ class TumRgbd(Recording):
         if (path / "groundtruth.txt").is_file():
             self.ground_truth, problems = read_trajectory_report(path / "groundtruth.txt")
             notes += problems
-        self.notes = tuple(notes)
+        self._images = ImageFiles(files, path)
+        self.notes = (*notes, *self._images.notes)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
         return (path / "rgb.txt").is_file() or (path.is_dir() and _pairs_file(path) is not None)
 
     def source(self, index: int) -> str:
-        return str(self._images[index])
+        return str(self._images.files[index])
 
     def image(self, index: int) -> UInt8:
-        return read_image(self._images[index])
+        return self._images.read(index)
 
     def depth(self, index: int) -> Float32 | None:
         row = self._depth_row[index]
@@ -79,17 +85,15 @@ def _read_list(path: Path, kind: str) -> tuple[Float64, list[Path], list[str]]:
     Raises:
         InputError: the file cannot be read or has no row `timestamp filename`.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); it must list `timestamp filename` rows") from None
+    lines = read_text(path, "a list of images", "it must list `timestamp filename` rows").splitlines()
     in_pairs = path.name != f"{kind}.txt"
     times, files, bad = [], [], 0
     for line in lines:
+        line = _DECIMAL_COMMA.sub(r"\1.\2", line)
         fields = line.replace(",", " ").split() if in_pairs else line.replace(",", " ").split(maxsplit=1)
         if not fields or fields[0].startswith("#"):
             continue
-        if len(fields) == 4 and fields[3].split("/")[0] == kind:
+        if len(fields) == 4 and re.split(r"[/\\]", fields[3])[0] == kind:
             fields = fields[2:4]
         try:
             time = float(fields[0])
@@ -99,13 +103,14 @@ def _read_list(path: Path, kind: str) -> tuple[Float64, list[Path], list[str]]:
             bad += 1
             continue
         times.append(time)
-        files.append(path.parent / fields[1].strip())
+        files.append(listed_file(path.parent, fields[1]))
     if not times:
         raise InputError(f"{path}: has no row `timestamp filename`; repair it or give the image folder itself")
-    stamps = np.asarray(times, np.float64)
+    stamps, unit = in_seconds(np.asarray(times, np.float64))
     order, repeated = increasing_order(stamps)
     notes = [f"{path}: {bad} rows are not `timestamp filename` and were left out"] if bad else []
     notes += [f"{path}: {repeated} rows repeat a time stamp and were left out"] if repeated else []
+    notes += [f"{path}: time stamps are taken as {unit}, by their size"] if unit else []
     return stamps[order], [files[row] for row in order], notes
 
 

@@ -6,7 +6,6 @@ phone by a per mille or so, so the median is used; a recording in which it moves
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,10 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration
+from improvo.geometry.text_files import decoded
 from improvo.geometry.trajectory_files import clean_poses
 from improvo.types import Float64, Trajectory
+from improvo.untrusted.text import load_json, reason
 
 MAX_VARIATION = 0.01
 _CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL cameras look along -z with y up
@@ -27,8 +28,9 @@ def median_calibration(
     distortion: tuple[float, ...] = (),
     distortion_model: str = "brown",
     size: tuple[int, int] | None = None,
-) -> tuple[Calibration, list[str]]:
-    """One calibration from fx, fy, cx, cy (N, 4) of all frames, and a note where they differ by more than 1 %.
+    notes: list[str] | None = None,
+) -> Calibration:
+    """One calibration from fx, fy, cx, cy (N, 4) of all frames; a line is added to `notes` where they differ by 1 %.
 
     Raises:
         InputError: no frame has usable intrinsics.
@@ -41,13 +43,12 @@ def median_calibration(
     calibration = Calibration(source, (fx, fy, cx, cy), distortion, distortion_model, size)
     calibration.camera(*(size or (1, 1)))
     variation = float(np.abs(values / [fx, fy, fx, fy] - np.array([fx, fy, cx, cy]) / [fx, fy, fx, fy]).max())
-    notes = []
-    if variation > MAX_VARIATION:
+    if variation > MAX_VARIATION and notes is not None:
         notes.append(
             f"{source}: the intrinsics vary by {100 * variation:.1f} % of the focal length between frames; the median "
             "is used, so expect less accuracy (lock the focus when recording)"
         )
-    return calibration, notes
+    return calibration
 
 
 def trajectory_from_opengl(
@@ -73,10 +74,9 @@ def read_json(path: Path, data: bytes | None = None) -> dict[str, Any]:
         InputError: not JSON, or no mapping.
     """
     try:
-        content = json.loads(path.read_bytes() if data is None else data)
-    except (OSError, ValueError, RecursionError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise InputError(f"{path}: cannot be read as JSON ({reason}); export it again") from None
+        content = load_json(decoded(path.read_bytes() if data is None else data))
+    except (OSError, ValueError, MemoryError) as error:
+        raise InputError(f"{path}: cannot be read as JSON ({reason(error)}); export it again") from None
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds no JSON object; export it again")
     return content
@@ -86,6 +86,6 @@ def numbers(values: Any, count: int) -> Float64:
     """(count,) float64, NaN where `values` is anything else."""
     try:
         result = np.array(values, np.float64).ravel()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError, RecursionError):
         return np.full(count, np.nan)
     return result if len(result) == count else np.full(count, np.nan)

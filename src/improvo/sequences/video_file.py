@@ -17,7 +17,8 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.geometry.camera_files import folder_calibration
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
-from improvo.sequences.image_folder import DEFAULT_FPS
+from improvo.sequences.rates import DEFAULT_FPS
+from improvo.sequences.video_codec import is_script, why_unreadable
 from improvo.types import Int64, UInt8
 
 VIDEO_SUFFIXES = frozenset(
@@ -58,17 +59,20 @@ class VideoFile(Recording):
             raise InputError(f"{path}: is no video file")
         if path.stat().st_size == 0:
             raise InputError(f"{path}: the file is empty; copy the video again")
+        if is_script(path):
+            raise InputError(f"{path}: is a text that names other files, not a video; give the videos themselves")
         self._position = -1  # frame that the decoder stands on
         self._image: UInt8 | None = None  # of `_position`, when it was asked for
         self._end: int | None = None  # where decoding turned out to end, before the last packet
         self._stamps, self._key_frames = _index(path)
         if len(self._stamps) == 0:
-            raise InputError(
-                f"{path}: cannot be opened as a video (truncated? unknown codec?); copy it again or convert it to MP4"
-            )
+            raise InputError(f"{path}: {why_unreadable(path)}")
         count = len(self._stamps)
         self.times = self._stamps / 1e6 if settings.fps is None else np.arange(count) / settings.fps
-        self.calibration = folder_calibration(path.parent, (f"{path.stem}.yaml", "camera.yaml"))
+        beside = tuple(f"{path.stem}{suffix}" for suffix in (".yaml", ".yml", ".json"))
+        self.calibration = self.own_calibration(
+            lambda: folder_calibration(path.parent, beside), lambda: folder_calibration(path.parent)
+        )
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -128,7 +132,7 @@ class VideoFile(Recording):
 
     def _opened(self) -> cv2.VideoCapture:
         if self._capture is None:
-            self._capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
+            self._capture = cv2.VideoCapture(_name(self.path), cv2.CAP_FFMPEG)
             self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         return self._capture
 
@@ -144,7 +148,7 @@ def _index(path: Path) -> tuple[Int64, Int64]:
     Where the packets' stamps are not those of the decoded frames (AVI with B-frames, MPEG-1), everything is decoded
     once, frames are then known by counting, and there are no key frames.
     """
-    packets = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+    packets = cv2.VideoCapture(_name(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
     stamps, is_key = [], []
     while packets.grab():
         stamps.append(_stamp(packets))
@@ -153,8 +157,11 @@ def _index(path: Path) -> tuple[Int64, Int64]:
     nothing = np.zeros(0, np.int64)
     if not stamps:
         return nothing, nothing
+    opening = _decoded_stamps(path, _CHECKED)
+    if not opening:
+        return nothing, nothing
     increasing, first = np.unique(np.array(stamps, np.int64), return_index=True)
-    if len(increasing) == len(stamps) and _decoded_stamps(path, _CHECKED) == increasing[:_CHECKED].tolist():
+    if len(increasing) == len(stamps) and opening == increasing[:_CHECKED].tolist():
         keys = np.flatnonzero(np.array(is_key)[first])
         return increasing, np.union1d(keys, [0]).astype(np.int64)
     decoded = np.array(_decoded_stamps(path), np.int64)
@@ -165,8 +172,13 @@ def _index(path: Path) -> tuple[Int64, Int64]:
     return decoded, nothing
 
 
+def _name(path: Path) -> str:
+    """The file for FFmpeg, which takes what stands before a colon in a relative name for a protocol."""
+    return str(path.absolute())
+
+
 def _decoded_stamps(path: Path, limit: int | None = None) -> list[int]:
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    capture = cv2.VideoCapture(_name(path), cv2.CAP_FFMPEG)
     stamps: list[int] = []
     while (limit is None or len(stamps) < limit) and capture.grab():
         stamps.append(_stamp(capture))

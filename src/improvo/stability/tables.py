@@ -23,6 +23,9 @@ from improvo.errors import InputError
 from improvo.files import written_atomically
 from improvo.stability.rule import STABILITY_NAMES, TrackLabels
 from improvo.types import Float32, Float64, Int64
+from improvo.untrusted.arrays import check_array
+from improvo.untrusted.limits import MAX_TABLE_BYTES
+from improvo.untrusted.text import reason
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -243,7 +246,7 @@ def read_points(path: Path) -> PointsTable:
     Raises:
         InputError: missing, no Parquet, or without the columns that `improvo run` and `improvo label` write.
     """
-    table = _read(path, points_schema())
+    table = read_table(path, points_schema())
     names = np.array(table["stability"].to_pylist(), dtype=object)
     codes = np.full(len(names), -1, np.int8)
     for code, name in enumerate(STABILITY_NAMES):
@@ -270,7 +273,7 @@ def read_tracks(path: Path) -> TracksTable:
     Raises:
         InputError: missing, no Parquet, or without the columns that `improvo run` and `improvo label` write.
     """
-    table = _read(path, tracks_schema())
+    table = read_table(path, tracks_schema())
     return TracksTable(
         table["frame"].to_numpy().astype(np.int64),
         table["track"].to_numpy(),
@@ -280,18 +283,34 @@ def read_tracks(path: Path) -> TracksTable:
     ).in_order()
 
 
-def _read(path: Path, schema: pa.Schema) -> pa.Table:
+def read_table(path: Path, schema: pa.Schema) -> pa.Table:
+    """The columns of a schema, as it has them, and none of them with gaps.
+
+    Raises:
+        InputError: missing, no Parquet, other columns, or many more rows than the file can hold.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        table = pq.read_table(path, memory_map=False)
+        file = pq.ParquetFile(path)
+        missing = [name for name in schema.names if name not in file.schema_arrow.names]
+        if missing:
+            raise InputError(f"{path}: lacks the column(s) {', '.join(missing)}; write it again with this version")
+        check_array("rows", (file.metadata.num_rows,), 8 * len(schema.names), _most_bytes(path.stat().st_size))
+        table = file.read(columns=schema.names).select(schema.names).cast(schema)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; `improvo run` and `improvo label` write it") from None
-    except (pa.ArrowException, OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path}: cannot be read as Parquet ({reason}); write it again") from None
-    missing = [name for name in schema.names if name not in table.column_names]
-    if missing:
-        raise InputError(f"{path}: lacks the column(s) {', '.join(missing)}; write it again with this version")
+    except (pa.ArrowException, OSError, ValueError, LookupError, TypeError, MemoryError) as error:
+        raise InputError(f"{path}: cannot be read as Parquet ({reason(error)}); write it again") from None
+    gaps = [name for name in schema.names if table[name].null_count]
+    if gaps:
+        raise InputError(f"{path}: has rows without {', '.join(gaps)}; write it again")
+    if any((table[name].to_numpy() < 0).any() for name in ("track", "frame") if name in schema.names):
+        raise InputError(f"{path}: has rows with a negative number; write it again")
     return table
+
+
+def _most_bytes(file_bytes: int) -> int:
+    """What a file may hold: compression makes less of our tables, but not a thousandth."""
+    return min(MAX_TABLE_BYTES, 1000 * file_bytes + (1 << 24))

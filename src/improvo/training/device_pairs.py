@@ -11,7 +11,7 @@ from torch import Tensor
 
 from improvo.errors import InputError
 from improvo.frontend.architecture import CELL
-from improvo.training.distributed import Share
+from improvo.training.distributed import Process
 from improvo.training.labels import DUSTBIN
 from improvo.training.photometric_batch import augment_batch
 from improvo.training.picture_store import DepthStore, PictureStore, on_device
@@ -77,7 +77,7 @@ class DevicePairs:
         K = [np.broadcast_to(s.K, (n, 3, 3)) for s, n in zip(posed, counts, strict=True)]
         self.K = np.concatenate([np.zeros((0, 3, 3)), *K])
         self.poses = np.concatenate([np.zeros((0, 4, 4)), *(sequence.world_from_cam for sequence in posed)])
-        self.share = Share.of_this_process()
+        self.process = Process.current()
 
     def __len__(self) -> int:
         return self.settings.optimiser.steps
@@ -88,9 +88,9 @@ class DevicePairs:
 
     def _batch(self, step: int) -> dict[str, Tensor]:
         settings, views = self.settings, self.settings.views
-        rng = np.random.default_rng([settings.optimiser.seed, step, self.share.rank])
+        rng = np.random.default_rng([settings.optimiser.seed, step, self.process.rank])
         generator = torch.Generator(self.device).manual_seed(int(rng.integers(2**62)))
-        plan = self._plan(rng, len(self.share.of(settings.optimiser.batch_size)))
+        plan = self._plan(rng, len(self.process.part_of(settings.optimiser.batch_size)))
         shown = self.store.views(plan.rows.T.ravel(), plan.view_from_picture, views.width, views.height)
         images = augment_batch(shown, rng, generator, settings.photometric)
         batch = {"images": images, "scenes": on_device(plan.scenes, self.device), **self.taught(images)}

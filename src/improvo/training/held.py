@@ -12,7 +12,7 @@ from torch.nn import functional
 from improvo.frontend.superpoint import SuperPoint, sample_descriptors
 from improvo.training.losses import held_loss, info_nce_loss
 from improvo.training.settings import HeldSettings
-from improvo.training.trainer import Stage
+from improvo.training.stage import Stage
 
 
 class HeldStage(Stage):

@@ -13,14 +13,16 @@ from torch import Tensor
 
 from improvo.errors import InputError
 from improvo.frontend.channel_pruning import without_dead_channels
+from improvo.frontend.runtime_torch import load_network
 from improvo.frontend.superpoint import SuperPoint
 from improvo.frontend.weights import DataSource, Weights, load_weights
 from improvo.training.device_pairs import DevicePairs, Teacher
 from improvo.training.held import HeldStage
+from improvo.training.networks import started_network
 from improvo.training.pictures import Pictures
 from improvo.training.posed import PosedSequence
 from improvo.training.settings import HeldSettings
-from improvo.training.stages import loaded, model_card, run_stage, started_network
+from improvo.training.stage_folder import model_card, run_stage
 from improvo.training.trainer import Batches, choose_device, choose_precision
 
 
@@ -89,7 +91,7 @@ def _with_tracks(dense: DevicePairs, labels: Sequence[Path]) -> Batches:
 
 def network_teacher(weights: Weights, head: str, device: torch.device, precision: torch.dtype) -> Teacher:
     """One head of a network that is not trained, on views (V, 1, H, W): logits (V, C, Hc, Wc)."""
-    network = loaded(without_dead_channels(weights)).requires_grad_(False)
+    network = load_network(without_dead_channels(weights)).requires_grad_(False)
     network = network.to(device, memory_format=torch.channels_last)
     chosen = getattr(network, head)
 

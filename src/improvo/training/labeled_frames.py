@@ -1,7 +1,7 @@
-"""A labelled sequence by frames: the points that a frame shows, and where another frame shows the same ones.
+"""A labeled sequence by frames: the points that a frame shows, and where another frame shows the same ones.
 
-A *landmark* is what correspondences speak of: a map point with all the tracks that own it, or a track without one.
-Beyond the paper, a stable landmark is also known in frames where no track saw it, if its projection is visible there.
+A *landmark* is a map point with all of its tracks, or a track without a map point. Correspondences are of landmarks.
+Beyond the paper, a stable landmark is also known in frames where no track observed it, if its projection is visible.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from improvo.frontend.masking import unmasked
 from improvo.geometry.se3 import transform
 from improvo.labeling.labeled import LabeledSequence
 from improvo.stability.grouping import medians, rows_of
 from improvo.stability.rule import IGNORE, STABLE, UNSTABLE
 from improvo.training.settings import LandmarkSettings
 from improvo.training.wrong_links import largest_step_shares
-from improvo.types import Float32, Float64, Int64, UInt8
+from improvo.types import Float32, Float64, Int64, Mask, UInt8
 
 Codes = NDArray[np.int8]
 
@@ -30,11 +31,11 @@ class FramePoints:
     points: Float64  # (N, 2)
     landmark: Int64  # (N,)
     stability: Codes  # (N,) codes of `improvo.stability.rule`
-    seen: NDArray[np.bool_]  # (N,) whether a track saw it in this frame, or only the projection says that it is there
+    seen: NDArray[np.bool_]  # (N,) whether a track observed it in this frame; else only its projection is known
 
 
 class LabeledFrames:
-    """Random access to the frames of one labelled sequence.
+    """Random access to the frames of one labeled sequence.
 
     Args:
         sequence: finished labels.
@@ -62,6 +63,13 @@ class LabeledFrames:
         if (image.shape[1], image.shape[0]) == self.size:
             return image
         return np.asarray(cv2.resize(image, self.size, interpolation=cv2.INTER_AREA), np.uint8)
+
+    def mask(self, frame: int) -> Mask | None:
+        """Which pixels of the training picture (H, W) are used; None are all."""
+        mask = self.sequence.mask(frame)
+        if mask is None:
+            return None
+        return np.asarray(cv2.resize(mask.astype(np.uint8) * 255, self.size, interpolation=cv2.INTER_AREA) == 255)
 
     def useful_frames(self, least: int) -> Int64:
         """Frames whose tracks have at least `least` stable points."""
@@ -110,10 +118,10 @@ class LabeledFrames:
         self._mean_error = np.nan_to_num(points.mean_error[representative].astype(np.float64), nan=np.inf)
 
     def _landmarks_of_tracks(self) -> tuple[Int64, Codes]:
-        """A number of the landmark (T,) and its stability (T,) for every track.
+        """The landmark (T,) and its stability (T,) for every track.
 
-        Tracks of one map point are one landmark if the rule finds all of their observations together stable: short
-        tracks, which alone have no label, then teach too. Others stay landmarks of their own.
+        Tracks of one map point are one landmark if the stability rule, applied to all of their observations together,
+        says stable. Short tracks, which have no label alone, then teach too. Other tracks are landmarks of their own.
         """
         points, rule = self.sequence.points, self.sequence.rule
         alone = -1 - np.arange(len(points))
@@ -157,11 +165,11 @@ class LabeledFrames:
         camera_points = transform(self._poses[frame], self._xyz[landmark])
         depth = camera_points[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            pixels = (camera_points @ self.sequence.camera.K.T)[:, :2] / depth[:, None]
+            pixels = self.sequence.camera.project(camera_points)
         return np.where(depth[:, None] > 0, pixels, np.nan), depth
 
     def _at_projection(self, frame: int, landmark: Int64, places: Float64) -> Float64:
-        """A stable point lies where its 3D point projects: that is the mean of all that was observed of it."""
+        """Stable points at the projections of their 3D points, which are the means of all observations."""
         if not self._usable[frame]:
             return places
         moved = (self._stability[landmark] == STABLE) & (self._segment[landmark] == self.sequence.frames.segment[frame])
@@ -193,14 +201,17 @@ class LabeledFrames:
         seen_alike = cosine >= np.cos(np.radians(settings.largest_view_angle_degrees))
         seen_alike &= (ratio <= settings.largest_distance_ratio) & (ratio >= 1 / settings.largest_distance_ratio)
         kept = np.flatnonzero(inside & seen_alike)
+        mask = self.sequence.mask(frame)
+        if mask is not None:
+            kept = kept[unmasked(pixels[kept].astype(np.float32), mask)]
         kept = kept[~self._hidden(frame, seen, pixels[kept], depth[kept])]
         return rows[kept], pixels[kept]
 
     def _hidden(self, frame: int, seen: Int64, pixels: Float64, depth: Float64) -> NDArray[np.bool_]:
-        """(N,) whether a point is not to be believed visible.
+        """(N,) whether a point may be hidden.
 
-        Either a point that the frame does show is near in the image and clearly nearer to the camera; or none is near
-        at all: a person who walks through hides the wall and has no stable points to say so.
+        Either an observed point is near it in the image and clearly nearer to the camera, or no observed point is near
+        it at all. A person who walks through the picture hides the wall behind and has no stable points.
         """
         from scipy.spatial import cKDTree
 
@@ -209,7 +220,7 @@ class LabeledFrames:
         shown, shown_depth = self._project(frame, seen)
         known = np.isfinite(shown).all(axis=1)
         if not known.any():
-            return np.ones(len(pixels), np.bool_)  # nothing tells
+            return np.ones(len(pixels), np.bool_)
         neighbours = min(4, int(known.sum()))
         distance, nearest = cKDTree(shown[known]).query(pixels, k=neighbours)
         distance, nearest = distance.reshape(len(pixels), -1), nearest.reshape(len(pixels), -1)

@@ -13,6 +13,9 @@ from improvo.files import written_atomically
 from improvo.training.settings import AdaptationSettings
 from improvo.training.views import inside, warp_points
 from improvo.types import Float32, Float64, Int64
+from improvo.untrusted.arrays import read_npz
+from improvo.untrusted.limits import MAX_TABLE_BYTES
+from improvo.untrusted.text import reason
 
 IGNORED = -1  # the value of a cell that says nothing
 DUSTBIN = 64  # the value of a cell without a keypoint
@@ -110,11 +113,16 @@ def load_labels(path: Path, pictures: list[int]) -> list[list[PointLabels]]:
         InputError: not such a file, or labels of other pictures.
     """
     try:
-        with np.load(path, allow_pickle=False) as data:
-            counts, points, agreement = data["counts"], data["points"], data["agreement"]
-            stored = data["pictures"].tolist()
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: cannot be read as keypoint labels ({error}); remove it to make it anew") from None
+        data = read_npz(path, limit=MAX_TABLE_BYTES)
+        counts, points, agreement = data["counts"], data["points"], data["agreement"]
+        stored = data["pictures"].tolist()
+        whole = counts.dtype.kind == data["pictures"].dtype.kind == "i" and counts.ndim == 1 and (counts >= 0).all()
+        whole = whole and points.shape == (counts.sum(), 2) and agreement.shape == (counts.sum(),)
+        if not whole or sum(stored) != len(counts) or not (points.dtype.kind == agreement.dtype.kind == "f"):
+            raise ValueError("its arrays do not belong together")
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        mend = "remove it to make it anew"
+        raise InputError(f"{path}: cannot be read as keypoint labels ({reason(error)}); {mend}") from None
     if stored != pictures:
         raise InputError(f"{path}: holds labels of other pictures; remove it to make it anew")
     ends = np.cumsum(counts)

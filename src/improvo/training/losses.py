@@ -6,16 +6,17 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from improvo.frontend.architecture import CELL
 from improvo.training.labels import DUSTBIN, IGNORED
 from improvo.training.settings import DetectorLossSettings
 
 
 def detector_loss(logits: Tensor, cells: Tensor, settings: DetectorLossSettings | None = None) -> Tensor:
-    """Softmax cross-entropy over the 65 classes of a cell; ignored cells count for nothing (paper, "Training Details").
+    """Mean softmax cross-entropy over the 65 classes of all cells but the ignored ones (paper, "Training Details").
 
-    Most cells have no keypoint, so this alone teaches for a long time only whether there is one. The position term,
-    which SuperPoint does not have, is the cross-entropy over the 64 pixels of the cells that have one, against a small
-    Gaussian about the keypoint.
+    Most cells have no keypoint. For a long time this alone teaches only whether there is one. The position term, which
+    SuperPoint does not have, is the cross-entropy over the 64 pixels of the cells that have a keypoint, against a
+    Gaussian about it.
 
     Args:
         logits: (B, 65, Hc, Wc).
@@ -57,10 +58,13 @@ def info_nce_loss(
     """Symmetric InfoNCE over sparse correspondences: each descriptor must pick its partner among those of its pair.
 
     Args:
-        a, b: (B, N, D) unit descriptors of corresponding points.
-        points_a, points_b: (B, N, 2) pixels; points nearer than `masked_pixels` in either view are not negatives.
-        valid: (B, N) bool.
+        a: (B, N, D) unit descriptors of view a.
+        b: (B, N, D) unit descriptors of view b; row n of both is one correspondence.
+        points_a: (B, N, 2) pixels of view a.
+        points_b: (B, N, 2) pixels of view b.
+        valid: (B, N) bool, rows that are a correspondence.
         scale: () inverse temperature.
+        masked_pixels: points nearer than this in either view are not each other's negatives.
         negative: (B, N) bool, which rows may be wrong partners of others; the valid ones where it is not given.
         group: so many consecutive pairs have their points for each other's negatives too; B must be a multiple.
         scenes: (B,) int; pairs of the same scene, which may show the same places, are not each other's negatives.
@@ -99,7 +103,8 @@ def held_loss(logits: Tensor, teacher: Tensor) -> Tensor:
     """Divergence (Kullback-Leibler) of the softmax over channels from the teacher's, mean over cells.
 
     Args:
-        logits, teacher: (B, C, Hc, Wc).
+        logits: (B, C, Hc, Wc) of the network.
+        teacher: (B, C, Hc, Wc) of the network that it is held to.
     """
     wanted = functional.log_softmax(teacher.float(), dim=1)
     given = functional.log_softmax(logits.float(), dim=1)
@@ -110,39 +115,54 @@ def hinge_loss(
     a: Tensor,
     b: Tensor,
     points_b: Tensor,
-    centres: Tensor,
+    places_b: Tensor,
     valid: Tensor,
+    known_b: Tensor | None = None,
     positive_margin: float = 1.0,
     negative_margin: float = 0.2,
     positive_weight: float = 250.0,
 ) -> Tensor:
-    """SuperPoint's dense hinge loss between all cells of two views (its equations 4 to 6).
+    """SuperPoint's hinge loss between all descriptors of two views (its equations 4 to 6).
+
+    SuperPoint compares all cells of both views. Where only some points are known, what is unknown is ignored.
 
     Args:
-        a, b: (B, N, D) unit descriptors of all cells of either view.
-        points_b: (B, N, 2) where the centres of the cells of view a lie in view b.
-        centres: (N, 2) centres of the cells; a pair of cells corresponds within 8 pixels.
-        valid: (B, N) bool, cells of view a that view b shows.
+        a: (B, N, D) unit descriptors of view a.
+        b: (B, M, D) unit descriptors of view b.
+        points_b: (B, N, 2) pixels of view b that show what the points of view a show.
+        places_b: (B, M, 2) pixels that the descriptors of view b are of; within 8 pixels of each other two correspond.
+        valid: (B, N) bool, rows of view a whose place in view b is known.
+        known_b: (B, M) bool, descriptors of view b that may be compared with; None for all.
+        positive_margin: corresponding descriptors are pulled up to this similarity.
+        negative_margin: others are pushed down to this similarity.
+        positive_weight: of the former, of which there are few.
     """
     similarity = torch.einsum("bnd,bmd->bnm", a, b)
-    same = (torch.cdist(points_b, centres.expand(len(a), -1, -1)) <= 8) & valid[:, :, None]
+    compared = valid[:, :, None].expand_as(similarity)
+    if known_b is not None:
+        compared = compared & known_b[:, None, :]
+    same = torch.cdist(points_b, places_b) <= CELL
     positive = positive_weight * (positive_margin - similarity).clamp(min=0)
     negative = (similarity - negative_margin).clamp(min=0)
-    return (torch.where(same, positive, negative) * valid[:, :, None]).sum() / (valid.sum().clamp(min=1) * b.shape[1])
+    return (torch.where(same, positive, negative) * compared).sum() / compared.sum().clamp(min=1)
 
 
-def stability_loss(logits: Tensor, stability: Tensor, stable_per_unstable: float) -> Tensor:
-    """Binary cross-entropy, balanced: over all labels, stable and unstable points weigh the same.
+def stability_loss(logits: Tensor, stability: Tensor, stable_per_unstable: float | None = None) -> Tensor:
+    """Binary cross-entropy at labeled points: the paper's, or balanced.
 
-    The balance is that of the whole label set, not of the batch: in a batch with one unstable point that one would
-    weigh as much as all others together, and such lone points are the wrong labels more often than others.
+    Balanced means that over all labels stable and unstable points weigh the same. The balance is that of the whole
+    label set, not of the batch. In a batch with one unstable point that one would weigh as much as all others together,
+    and such lone points are the wrong labels more often than others.
 
     Args:
-        logits: (B, N, 2) at labelled points; channel 1 is "stable".
+        logits: (B, N, 2) at labeled points; channel 1 is "stable".
         stability: (B, N) int64, 1 stable, 0 unstable, `IGNORED`.
-        stable_per_unstable: how many labels of one kind there are for one of the other.
+        stable_per_unstable: how many labels of one kind there are for one of the other; None does not balance, so every
+            labeled point weighs the same.
     """
     errors = functional.cross_entropy(logits.transpose(1, 2), stability, ignore_index=IGNORED, reduction="none")
+    if stable_per_unstable is None:
+        return errors.sum() / (stability != IGNORED).sum().clamp(min=1)
     stable, unstable = ((errors * (stability == code)).sum() for code in (1, 0))
     return 0.5 * (stable + stable_per_unstable * unstable) / (stability == 1).sum().clamp(min=1)
 

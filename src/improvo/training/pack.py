@@ -16,11 +16,16 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.files import written_atomically
 from improvo.frontend.weights import DataSource
+from improvo.sequences.base import UnreadableFrameError
+from improvo.sequences.images import decode
 from improvo.training.pictures import Pictures, Source
 from improvo.training.posed import PosedSequence
 from improvo.types import Float32, UInt8
+from improvo.untrusted.arrays import FAULTS
+from improvo.untrusted.text import load_json, reason
 
 _INDEX = "index.json"
+_FAULTS: tuple[type[Exception], ...] = (*FAULTS, UnreadableFrameError)
 _DEPTH_LEVELS = 4095  # of inverse depth: fine enough for 3 % at a twelfth of the nearest point, and small as PNG
 
 
@@ -64,9 +69,16 @@ def read_pack(path: Path) -> tuple[Pictures, list[PosedSequence], tuple[DataSour
     try:
         with zipfile.ZipFile(path) as file:
             content = {name: file.read(name) for name in file.namelist()}
-        index = json.loads(content[_INDEX])
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: is no pack of training data ({error}); make it with recipes/gpu_pack.py") from None
+        index = load_json(content[_INDEX].decode())
+        return _unpacked(content, index)
+    except _FAULTS as error:
+        mend = "make it with recipes/gpu_pack.py"
+        raise InputError(f"{path}: is no pack of training data ({reason(error)}); {mend}") from None
+
+
+def _unpacked(
+    content: dict[str, bytes], index: dict[str, Any]
+) -> tuple[Pictures, list[PosedSequence], tuple[DataSource, ...]]:
     with ThreadPoolExecutor() as pool:
         sources = tuple(
             Source(
@@ -97,10 +109,10 @@ def _encoded(suffix: str, image: np.ndarray, level: int) -> bytes:
 
 
 def _grey(content: bytes) -> UInt8:
-    return np.asarray(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE))
+    return np.asarray(decode(content, cv2.IMREAD_GRAYSCALE))
 
 
 def _depths(contents: Iterator[bytes], unit: float) -> Iterator[Float32]:
     for content in contents:
-        levels = np.asarray(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED), np.float32)
+        levels = np.asarray(decode(content, cv2.IMREAD_UNCHANGED), np.float32)
         yield levels * np.float32(unit)

@@ -1,4 +1,4 @@
-"""Batches of pairs of views with exact correspondences: what joint training of detector and descriptor eats."""
+"""Pairs of views of one picture, with exact correspondences: the batches of `improvo train homographies`."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from improvo.training.distributed import Share
 from improvo.training.labels import PointLabels, label_cells
 from improvo.training.photometric import augment
 from improvo.training.pictures import Pictures
-from improvo.training.settings import HomographiesSettings
+from improvo.training.seeded_batches import Batch, SeededBatches
+from improvo.training.settings import HINGE, HomographiesSettings
 from improvo.training.views import cell_centres, inside, random_view, warp_image, warp_points
 from improvo.types import Float32, Float64, Int64, UInt8
-
-Batch = dict[str, np.ndarray]  # images, cells, points_a, points_b, valid; see `PairBatches`
 
 
 @dataclass(frozen=True)
@@ -28,25 +26,24 @@ class View:
     view_from_picture: Float64  # (3, 3)
 
 
-class PairBatches:
-    """Batch number i, always the same for the same seed: (2B) images, first the a views, then the b views.
+class PairBatches(SeededBatches):
+    """Batches of (2B) images, first the a views, then the b views.
 
     A batch has `images` (2B, 1, H, W) uint8, `cells` (2B, Hc, Wc) int64, `points_a` and `points_b` (B, N, 2) float32
     pixels that show the same place, and `valid` (B, N) bool.
+
+    Args:
+        pictures: of all sources.
+        labels: keypoints of every picture of every source.
+        settings: of the stage.
     """
 
     def __init__(self, pictures: Pictures, labels: list[list[PointLabels]], settings: HomographiesSettings) -> None:
+        super().__init__(settings)
         self.pictures, self.labels, self.settings = pictures, labels, settings
-        self.share = Share.of_this_process()
-
-    def __len__(self) -> int:
-        return self.settings.optimiser.steps
 
     def __getitem__(self, step: int) -> Batch:
-        cv2.setNumThreads(0)
-        seed = self.settings.optimiser.seed
-        own = self.share.of(self.settings.optimiser.batch_size)
-        pairs = [self.pair(np.random.default_rng([seed, step, number])) for number in own]
+        pairs = [self.pair(rng) for rng in self.generators(step)]
         a, b, points = [p[0] for p in pairs], [p[1] for p in pairs], [p[2] for p in pairs]
         return {
             "images": np.stack([view.image for view in a + b])[:, None],
@@ -98,7 +95,7 @@ class PairBatches:
         """Half at keypoints of view a, the rest anywhere; for the hinge loss the centres of all cells."""
         settings = self.settings
         width, height = settings.views.width, settings.views.height
-        if settings.descriptor_loss == "hinge":
+        if settings.descriptor_loss == HINGE:
             points_a = cell_centres(width, height)
         else:
             points_a = rng.uniform((0, 0), (width - 1, height - 1), (settings.points, 2)).astype(np.float32)

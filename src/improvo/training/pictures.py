@@ -11,6 +11,10 @@ import numpy as np
 
 from improvo import terminal
 from improvo.errors import InputError
+from improvo.geometry.camera_files import folder_calibration
+from improvo.geometry.trajectory_files import read_trajectory
+from improvo.sequences.base import UnreadableFrameError
+from improvo.sequences.images import read_grey
 from improvo.types import Float64, UInt8
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
@@ -58,7 +62,9 @@ def load_pictures(paths: Iterable[str], longer_side: int = 320, progress: bool =
 
     Args:
         paths: folders or sequences, each optionally followed by `=WEIGHT`; without it a source weighs the square root
-            of its number of pictures, so that long recordings do not drown short ones.
+            of its number of pictures, so that long recordings leave room for short ones.
+        longer_side: pixels.
+        progress: show it.
 
     Raises:
         InputError: a source without a readable picture, or a weight that is not a positive number.
@@ -107,11 +113,11 @@ def _read(path: Path, longer_side: int) -> tuple[list[UInt8], list[str], list[st
         return _read_sequence(path, longer_side)
     pictures, names, unread = [], [], []
     for file in files:
-        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        if image is None:
+        try:
+            pictures.append(_reduced(read_grey(file), longer_side))
+        except UnreadableFrameError:  # noqa: PERF203 - any file may be damaged
             unread.append(str(file))
         else:
-            pictures.append(_reduced(image, longer_side))
             names.append(file.name)
     return pictures, names, unread
 
@@ -137,21 +143,26 @@ def _reduced(image: UInt8, longer_side: int) -> UInt8:
 
 
 def _rotating(path: Path, count: int, shape: Sequence[int]) -> Float64 | None:
-    """K·R of every picture if `groundtruth.txt` and `camera.yaml` say that the camera turns without moving."""
-    import yaml
-    from scipy.spatial.transform import Rotation
+    """K·R (N, 3, 3) of every picture if the folder's poses and camera say that the camera turns without moving.
 
-    truth, camera = path / "groundtruth.txt", path / "camera.yaml"
-    if not (truth.is_file() and camera.is_file()):
+    Args:
+        path: folder with `groundtruth.txt` and `camera.yaml`.
+        count: of pictures; there must be as many poses.
+        shape: height and width of the pictures, which must be those of the camera.
+    """
+    truth, (height, width) = path / "groundtruth.txt", shape
+    if not truth.is_file():
         return None
     try:
-        rows = np.loadtxt(truth, ndmin=2)
-        values = yaml.safe_load(camera.read_text())
-        K = np.array([[values["fx"], 0, values["cx"]], [0, values["fy"], values["cy"]], [0, 0, 1]], np.float64)
-        pinhole = not any(values.get("distortion") or ()) and (values["height"], values["width"]) == tuple(shape)
-    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
+        calibration = folder_calibration(path)
+        if calibration is None or calibration.size != (width, height):
+            return None
+        camera, trajectory = calibration.camera(width, height), read_trajectory(truth, "tum")
+    except InputError:
         return None
-    if not pinhole or rows.shape != (count, 8) or np.ptp(rows[:, 1:4], axis=0).max() > 1e-9:
+    world_from_cam = trajectory.world_from_cam
+    if not camera.is_pinhole or len(trajectory) != count or not trajectory.valid.all():
         return None
-    world_from_cam = Rotation.from_quat(rows[:, 4:8]).as_matrix()
-    return np.asarray(K @ world_from_cam.transpose(0, 2, 1))
+    if np.ptp(world_from_cam[:, :3, 3], axis=0).max() > 1e-9:
+        return None
+    return np.asarray(camera.K @ world_from_cam[:, :3, :3].transpose(0, 2, 1))

@@ -1,10 +1,18 @@
-"""The settings of the training stages; importable without torch."""
+"""The settings of the training stages; importable without torch. Values that no stage knows are refused here."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 from improvo.errors import ConfigError
+from improvo.frontend.architecture import ARCHITECTURES, CELL
+from improvo.training.setting_checks import Checks
+
+INFO_NCE, HINGE = "info_nce", "hinge"
+DESCRIPTOR_LOSSES = (INFO_NCE, HINGE)
+PRECISIONS = ("auto", "float32", "bfloat16")
+DEVICES = ("auto", "cpu", "cuda", "cuda:1")
+_DEVICE = r"cuda:\d+|mps"
 
 
 @dataclass(frozen=True)
@@ -28,6 +36,16 @@ class OptimiserSettings:
     checkpoint_minutes: float = 3.0
     log_every: int = 20  # steps between rows of metrics.jsonl
 
+    def __post_init__(self) -> None:
+        checks = Checks(self, "optimiser")
+        checks.at_least(1, "steps", "batch_size", "log_every")
+        checks.at_least(0, "weight_decay", "warmup_steps", "decay_steps", "seed", "threads", "workers")
+        checks.at_least(0, "checkpoint_minutes")
+        checks.positive("learning_rate", "clip_norm")
+        checks.between(0, 1, "ema")
+        checks.choice("device", DEVICES, _DEVICE)
+        checks.choice("precision", PRECISIONS)
+
 
 @dataclass(frozen=True)
 class DetectorLossSettings:
@@ -35,6 +53,11 @@ class DetectorLossSettings:
 
     position_weight: float = 1.0  # of the term that says where in its cell a keypoint is; 0 is SuperPoint's loss
     position_sigma: float = 0.7  # pixels; how sharply
+
+    def __post_init__(self) -> None:
+        checks = Checks(self, "detector")
+        checks.at_least(0, "position_weight")
+        checks.positive("position_sigma")
 
 
 @dataclass(frozen=True)
@@ -49,6 +72,19 @@ class ViewSettings:
     perspective: float = 0.2  # largest displacement of a corner, as a share of the view's side
     stretch: float = 0.35  # largest log-ratio of the scales along two perpendicular directions (foreshortening)
     shift: float = 0.3  # largest distance of the second view's centre from the first's, as a share of its side
+
+    def __post_init__(self) -> None:
+        checks = Checks(self, "views")
+        for name in ("width", "height"):
+            side = getattr(self, name)
+            checks.that(
+                name, side >= 2 * CELL and side % CELL == 0, f"must be a multiple of {CELL}, {2 * CELL} or more"
+            )
+        checks.positive("smallest_zoom", "largest_zoom")
+        checks.that("largest_zoom", self.largest_zoom >= self.smallest_zoom, "must be no smaller than `smallest_zoom`")
+        checks.between(0, 180, "rotation_degrees")
+        checks.between(0, 1, "perspective", "shift")
+        checks.at_least(0, "stretch")
 
 
 @dataclass(frozen=True)
@@ -70,6 +106,17 @@ class PhotometricSettings:
     jpeg_share: float = 0.3
     jpeg_quality: tuple[int, int] = (40, 95)
 
+    def __post_init__(self) -> None:
+        checks = Checks(self, "photometric")
+        checks.between(0, 1, "shade_share", "vignette_share", "blur_share", "motion_share", "jpeg_share")
+        checks.between(0, 1, "shade", "speckle")
+        checks.at_least(0, "brightness", "blur_sigma", "motion_length", "noise")
+        checks.interval("contrast", above=0)
+        checks.interval("gamma", above=0)
+        checks.interval("jpeg_quality", above=0, most=100)
+        low, high = self.jpeg_quality
+        checks.that("jpeg_quality", low < high, "must be two numbers, the second larger than the first")
+
 
 @dataclass(frozen=True)
 class AdaptationSettings:
@@ -83,12 +130,19 @@ class AdaptationSettings:
     accepted: float = 0.3
     undecided: float = 0.15
 
+    def __post_init__(self) -> None:
+        checks = Checks(self, "adaptation")
+        checks.at_least(1, "views", "keypoints_per_view")
+        checks.at_least(0, "border", "suppression")
+        checks.between(0, 1, "accepted", "undecided")
+        checks.that("undecided", self.undecided <= self.accepted, "must be no larger than `accepted`")
+
 
 @dataclass(frozen=True)
 class HomographiesSettings:
     """`improvo train homographies`: homographic adaptation, then detector and descriptor on pairs of views."""
 
-    architecture: str = "superpoint"
+    architecture: str = "superpoint"  # superpoint | superpoint-small
     # channels of the first four layers that are used, the others stay zero (`improvo.frontend.channel_pruning`); 0 for
     # as many as the weights use that are started from
     stem_channels: int = 0
@@ -97,38 +151,50 @@ class HomographiesSettings:
     shapes_share: float = 0.12  # of the pairs
     descriptor_loss: str = "info_nce"  # info_nce | hinge (SuperPoint's own)
     descriptor_weight: float = 1.0
-    points: int = 256  # correspondences a pair; half of them at labelled keypoints
-    masked_pixels: float = 8.0  # points nearer than this are not each other's negatives
+    points: int = 256  # correspondences a pair; half of them at labeled keypoints (info_nce; hinge takes all cells)
+    masked_pixels: float = 8.0  # points nearer than this are not each other's negatives (info_nce)
     detector: DetectorLossSettings = field(default_factory=DetectorLossSettings)
     optimiser: OptimiserSettings = field(default_factory=OptimiserSettings)
     views: ViewSettings = field(default_factory=ViewSettings)
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
     adaptation: AdaptationSettings = field(default_factory=AdaptationSettings)
 
+    def __post_init__(self) -> None:
+        checks = Checks(self)
+        checks.choice("architecture", ARCHITECTURES)
+        checks.choice("descriptor_loss", DESCRIPTOR_LOSSES)
+        checks.at_least(0, "stem_channels", "shapes", "descriptor_weight", "masked_pixels")
+        checks.at_least(2, "points")
+        checks.at_least(2 * CELL, "longer_side")
+        checks.that("shapes_share", 0 <= self.shapes_share < 1, "must be 0 or more and less than 1")
+
 
 @dataclass(frozen=True)
 class ShapesSettings:
     """`improvo train shapes`: a detector from drawn shapes alone ("MagicPoint")."""
 
-    architecture: str = "superpoint"
+    architecture: str = "superpoint"  # superpoint | superpoint-small
     detector: DetectorLossSettings = field(default_factory=DetectorLossSettings)
     optimiser: OptimiserSettings = field(default_factory=lambda: OptimiserSettings(batch_size=32))
     views: ViewSettings = field(default_factory=ViewSettings)
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
     adaptation: AdaptationSettings = field(default_factory=AdaptationSettings)
 
+    def __post_init__(self) -> None:
+        Checks(self).choice("architecture", ARCHITECTURES)
+
 
 @dataclass(frozen=True)
 class LandmarkSettings:
-    """What labelled frames tell beyond the tracks that each of them holds; pixels are those of the training picture."""
+    """What is known of a frame beyond the tracks that observe it; pixels are those of the training picture."""
 
-    shared: bool = True  # the tracks of one map point are judged together; False is the paper: each for itself
+    shared: bool = True  # the tracks of one map point are labeled together; False is the paper: each for itself
     unseen: bool = True  # stable points are also known where only their projection shows them; False is the paper
     reprojected: bool = True  # a stable point lies at its projection, not at the keypoint; False is the paper
-    # pixels; an unstable track whose median error is smaller has a wrong link or two, which say nothing on the place it
-    # shows, and is not taught as unstable; 0 is the paper
+    # pixels; an unstable track with a smaller median error has a wrong link or two. That says nothing about the place
+    # it shows, so it is not taught as unstable; 0 is the paper
     unstable_median_error: float = 1.0
-    # an unstable track is not taught either if one link makes more than this share of the way that its error goes
+    # nor is an unstable track taught if one link makes more than this share of the way that its error goes
     # (`improvo.training.wrong_links`); 1 is the paper
     unstable_largest_step: float = 0.25
     largest_correction: float = 2.0  # pixels of the recording between the two; beyond it the keypoint holds
@@ -138,22 +204,36 @@ class LandmarkSettings:
     occlusion_pixels: float = 14.0
     occlusion_depth: float = 0.15  # by how much nearer, as a share
 
+    def __post_init__(self) -> None:
+        checks = Checks(self, "landmarks")
+        checks.at_least(0, "unstable_median_error", "largest_correction", "occlusion_pixels")
+        checks.between(0, 1, "unstable_largest_step", "occlusion_depth")
+        checks.between(0, 180, "largest_view_angle_degrees")
+        checks.at_least(1, "largest_distance_ratio")
+
 
 @dataclass(frozen=True)
 class PairSettings:
     """Which two frames make a pair, and what is taught about them."""
 
     largest_gap: int = 60  # frames (paper, "Training Details")
-    wide_baselines: float = 0.5  # a gap is drawn with a density that rises with this power of it; 0 is uniform
+    wide_baselines: float = 0.5  # a gap is drawn with a density that rises with this power of it; 0 (paper) is uniform
     same_frame_share: float = 0.3  # of the pairs show one frame twice, where every pixel's partner is known
-    rehearsed_share: float = 0.5  # of the pairs are homography pairs of other pictures, where such are given
-    least_points: int = 16  # correspondences that two frames must have; else nearer ones are taken
+    replay_share: float = 0.5  # of the pairs are homography pairs of other pictures, where such are given
+    least_points: int = 16  # points that two frames must share, else nearer ones are taken; 0 (the paper) asks for none
     points: int = 256  # correspondences taught per pair
-    stability_points: int = 200  # labelled points taught per view, at most; as many unstable ones as there are
+    stability_points: int = 200  # labeled points taught per view, at most; up to half of them unstable ones
     # a cell in which no keypoint was ever followed to a neighbouring frame is taught to have none; False ignores it
     untracked_is_background: bool = True
-    # False: labelled frames teach descriptors and stability, and the detector learns from what is rehearsed alone
+    # False: labeled frames teach descriptors and stability; the detector learns from replay alone
     teach_detector: bool = True
+
+    def __post_init__(self) -> None:
+        checks = Checks(self, "pairs")
+        checks.at_least(1, "largest_gap")
+        checks.at_least(0, "wide_baselines", "least_points")
+        checks.between(0, 1, "same_frame_share", "replay_share")
+        checks.at_least(2, "points", "stability_points")
 
 
 @dataclass(frozen=True)
@@ -164,9 +244,11 @@ class OdometryTrainingSettings:
     detector_weight: float = 0.3
     descriptor_weight: float = 1.0
     stability_weight: float = 1.0
-    negatives_across: bool = False  # a descriptor must also differ from those of the batch's other pairs
-    stability_alone: bool = False  # train only that head, on what the others read: keypoints and descriptors stay
-    masked_pixels: float = 8.0  # points nearer than this are not each other's negatives
+    descriptor_loss: str = "info_nce"  # info_nce | hinge (SuperPoint's own)
+    stability_balanced: bool = True  # stable and unstable labels weigh the same in all; False is the paper
+    negatives_across: bool = False  # a descriptor must also differ from those of the batch's other pairs (info_nce)
+    stability_alone: bool = False  # train only that head: keypoints and descriptors stay as they are
+    masked_pixels: float = 8.0  # points nearer than this are not each other's negatives (info_nce)
     detector: DetectorLossSettings = field(default_factory=DetectorLossSettings)
     pairs: PairSettings = field(default_factory=PairSettings)
     landmarks: LandmarkSettings = field(default_factory=LandmarkSettings)
@@ -175,6 +257,14 @@ class OdometryTrainingSettings:
     )
     views: ViewSettings = field(default_factory=ViewSettings)
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
+
+    def __post_init__(self) -> None:
+        checks = Checks(self)
+        checks.choice("descriptor_loss", DESCRIPTOR_LOSSES)
+        checks.at_least(0, "detector_weight", "descriptor_weight", "stability_weight", "masked_pixels")
+        checks.at_least(2 * CELL, "longer_side")
+        good = not self.negatives_across or self.descriptor_loss == INFO_NCE
+        checks.that("negatives_across", good, f"needs `descriptor_loss={INFO_NCE}`")
 
 
 @dataclass(frozen=True)
@@ -191,13 +281,11 @@ class DevicePairSettings:
     group: int = 4  # so many pairs are each other's wrong partners
 
     def __post_init__(self) -> None:
-        for name in ("posed_share", "keypoint_share", "least_overlap"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"setting `pairs.{name}`: {getattr(self, name)} must lie between 0 and 1")
-        if self.points < 2 or self.group < 1:
-            raise ConfigError("settings `pairs.points` and `pairs.group`: at least 2 points and groups of 1")
-        if self.largest_gap <= 0 or self.depth_tolerance <= 0:
-            raise ConfigError("settings `pairs.largest_gap` and `pairs.depth_tolerance`: must be above 0")
+        checks = Checks(self, "pairs")
+        checks.between(0, 1, "posed_share", "keypoint_share", "least_overlap")
+        checks.at_least(2, "points")
+        checks.at_least(1, "group")
+        checks.positive("largest_gap", "depth_tolerance")
 
 
 @dataclass(frozen=True)
@@ -223,8 +311,10 @@ class HeldSettings:
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
 
     def __post_init__(self) -> None:
-        if self.views.width % 8 or self.views.height % 8:
-            raise ConfigError("settings `views.width` and `views.height`: must be multiples of 8")
+        checks = Checks(self)
+        checks.at_least(0, "descriptor_weight", "detector_weight", "stability_weight", "masked_pixels")
+        checks.at_least(2 * CELL, "longer_side")
+        checks.at_least(1, "stability_every")
         if self.optimiser.batch_size % self.pairs.group:
             raise ConfigError(
                 f"setting `optimiser.batch_size`: {self.optimiser.batch_size} is no multiple of `pairs.group` "
@@ -232,5 +322,3 @@ class HeldSettings:
             )
         if self.optimiser.workers:
             raise ConfigError("setting `optimiser.workers`: batches made on the device need 0")
-        if self.stability_every < 1:
-            raise ConfigError("setting `stability_every`: must be at least 1")

@@ -100,9 +100,8 @@ def _polygons(canvas: Canvas, rng: np.random.Generator) -> None:
     for _ in range(30):
         radius = canvas.size.min() * rng.uniform(0.06, 0.2)
         centre = rng.uniform(0, 1, 2) * canvas.size
-        if any(np.linalg.norm(centre - other) < radius + r + 3 for other, r in placed):
+        if not _placed_apart(placed, centre, radius):
             continue
-        placed.append((centre, radius))
         corners = _random_polygon(rng, centre, radius)
         canvas.polygon(corners, canvas.contrasting())
         canvas.mark(corners)
@@ -113,9 +112,8 @@ def _ellipses(canvas: Canvas, rng: np.random.Generator) -> None:
     for _ in range(20):
         axes = canvas.size.min() * rng.uniform(0.03, 0.2, 2)
         centre = rng.uniform(0, 1, 2) * canvas.size
-        if any(np.linalg.norm(centre - other) < axes.max() + r + 3 for other, r in placed):
+        if not _placed_apart(placed, centre, float(axes.max())):
             continue
-        placed.append((centre, float(axes.max())))
         canvas.ellipse(centre, axes, rng.uniform(0, np.pi), canvas.contrasting())
 
 
@@ -230,6 +228,14 @@ def _random_polygon(rng: np.random.Generator, centre: Float64, radius: float) ->
         bend /= np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
         if bend.min() > 0.35:
             return np.asarray(corners)
+
+
+def _placed_apart(placed: list[tuple[Float64, float]], centre: Float64, radius: float) -> bool:
+    """Whether a circle keeps 3 pixels from those that are placed; it is then one of them."""
+    if any(np.linalg.norm(centre - other) < radius + r + 3 for other, r in placed):
+        return False
+    placed.append((centre, radius))
+    return True
 
 
 def _segments_near(one: Float64, other: Float64, distance: float) -> bool:

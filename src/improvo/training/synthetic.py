@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from improvo.training.distributed import Share
 from improvo.training.labels import PointLabels, label_cells
 from improvo.training.photometric import augment
 from improvo.training.pictures import Source
+from improvo.training.seeded_batches import Batch, SeededBatches
 from improvo.training.settings import ShapesSettings
 from improvo.training.shapes import FAMILIES, draw_shape
 from improvo.training.views import random_view, warp_image, warp_points
@@ -17,7 +17,13 @@ SIZE = (320, 240)  # width, height of the drawn pictures
 
 
 def shape_source(count: int, seed: int, weight: float) -> tuple[Source, list[PointLabels]]:
-    """`count` pictures, families in turn, with their exact corners as labels that every view agrees on."""
+    """Drawn pictures, families in turn, with their exact corners as labels that every view agrees on.
+
+    Args:
+        count: of pictures.
+        seed: of the drawings.
+        weight: how often the source is drawn from, relative to the others.
+    """
     families = list(FAMILIES)
     pictures, labels = [], []
     for index in range(count):
@@ -28,24 +34,19 @@ def shape_source(count: int, seed: int, weight: float) -> tuple[Source, list[Poi
     return Source("shapes", tuple(pictures), names, weight), labels
 
 
-class ShapeBatches:
-    """Batch number i of freshly drawn shapes: `images` (B, 1, H, W) uint8 and `cells` (B, Hc, Wc) int64."""
+class ShapeBatches(SeededBatches):
+    """Batches of freshly drawn shapes: `images` (B, 1, H, W) uint8 and `cells` (B, Hc, Wc) int64."""
 
     def __init__(self, settings: ShapesSettings) -> None:
+        super().__init__(settings)
         self.settings = settings
-        self.share = Share.of_this_process()
 
-    def __len__(self) -> int:
-        return self.settings.optimiser.steps
-
-    def __getitem__(self, step: int) -> dict[str, np.ndarray]:
-        cv2.setNumThreads(0)
+    def __getitem__(self, step: int) -> Batch:
         settings = self.settings
         families = list(FAMILIES)
         width, height = settings.views.width, settings.views.height
         images, cells = [], []
-        for number in self.share.of(settings.optimiser.batch_size):
-            rng = np.random.default_rng([settings.optimiser.seed, step, number])
+        for rng in self.generators(step):
             picture, points = draw_shape(rng, families[rng.integers(len(families))], *SIZE)
             H = random_view(rng, settings.views, SIZE)
             images.append(augment(warp_image(picture, H, width, height), rng, settings.photometric))

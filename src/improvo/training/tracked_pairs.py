@@ -1,24 +1,26 @@
-"""Batches of pairs of frames with what the odometry knows of them: what VO adaptation eats (paper, figure 5)."""
+"""Pairs of frames with what the odometry knows of them: the batches of VO adaptation (paper, Siamese training)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from improvo.frontend.masking import unmasked
 from improvo.stability.rule import STABLE, UNSTABLE
-from improvo.training.distributed import Share
 from improvo.training.labeled_frames import FramePoints, LabeledFrames, common_points
 from improvo.training.labels import DUSTBIN, IGNORED, label_cells
 from improvo.training.pairs import PairBatches, View
 from improvo.training.photometric import augment
+from improvo.training.seeded_batches import Batch, SeededBatches
 from improvo.training.settings import AdaptationSettings, OdometryTrainingSettings
 from improvo.training.views import inside, random_view, warp_image, warp_points
 from improvo.types import Float32, Float64, Int64, UInt8
 
-Batch = dict[str, np.ndarray]  # see `TrackedPairs`
 _CERTAIN, _UNDECIDED = 1.0, 0.2  # agreement of labels as `label_cells` takes it, on either side of `accepted`
 
 
@@ -30,6 +32,7 @@ class TrackedView:
     cells: Int64  # (Hc, Wc) see `label_cells`
     known: FramePoints  # of the frame; `points` in pixels of the view, NaN or outside where not visible
     view_from_frame: Float64  # (3, 3)
+    used: NDArray[np.bool_] | None = None  # (H, W) what shows the frame and is not masked; None without a mask
 
 
 @dataclass(frozen=True)
@@ -38,45 +41,40 @@ class Correspondences:
 
     a: Float32  # (N, 2) pixels
     b: Float32  # (N, 2)
-    valid: np.ndarray  # (N,) bool, both show the same point
-    negative: (
-        np.ndarray
-    )  # (N,) bool, the row may serve as a wrong partner for others: valid ones, and keypoints without
+    valid: NDArray[np.bool_]  # (N,) both show the same point
+    negative: NDArray[np.bool_]  # (N,) the row may be a wrong partner of others: valid ones, and keypoints without any
 
 
-class TrackedPairs:
-    """Batch number i, always the same for the same seed: (2B) images, first the a views, then the b views.
+class TrackedPairs(SeededBatches):
+    """Batches of (2B) images, first the a views, then the b views.
 
     A batch has `images` (2B, 1, H, W) uint8, `cells` (2B, Hc, Wc) int64, `points_a`, `points_b` (B, N, 2) float32,
     `valid`, `negative` (B, N) bool, `stability_points` (2B, M, 2) float32 and `stability` (2B, M) int64: 1 stable,
     0 unstable, IGNORED.
 
     Args:
-        rehearsed: homography pairs of other pictures, which keep the network general; `pairs.rehearsed_share` of all.
+        sequences: labeled video.
+        settings: of the stage.
+        replay: homography pairs of other pictures, which keep the network general; `pairs.replay_share` of all.
     """
 
     def __init__(
         self,
         sequences: Sequence[LabeledFrames],
         settings: OdometryTrainingSettings,
-        rehearsed: PairBatches | None = None,
+        replay: PairBatches | None = None,
     ) -> None:
-        self.sequences, self.settings, self.rehearsed = sequences, settings, rehearsed
-        self.useful = [frames.useful_frames(settings.pairs.least_points) for frames in sequences]
-        # as with pictures: long recordings do not drown short ones
+        super().__init__(settings)
+        self.sequences, self.settings, self.replay = sequences, settings, replay
+        self.useful = [frames.useful_frames(max(settings.pairs.least_points, 1)) for frames in sequences]
+        # as with pictures: long recordings leave room for short ones
         self._cumulative = np.cumsum(np.sqrt([len(useful) for useful in self.useful]))
-        self.share = Share.of_this_process()
         taught = np.array([frames.taught_stability() for frames in sequences]).sum(axis=0)
         self.stable_per_unstable = float(taught[0] / max(taught[1], 1))
 
-    def __len__(self) -> int:
-        return self.settings.optimiser.steps
-
     def __getitem__(self, step: int) -> Batch:
-        cv2.setNumThreads(0)
         seed = self.settings.optimiser.seed
-        own = self.share.of(self.settings.optimiser.batch_size)
-        pairs = [self._pair(np.random.default_rng([seed, step, number])) for number in own]
+        pairs = [self._pair(rng) for rng in self.generators(step)]
         views = [pair[0] for pair in pairs] + [pair[1] for pair in pairs]
         taught = [self._stability(np.random.default_rng([seed, step, n, 1]), view) for n, view in enumerate(views)]
         return {
@@ -91,15 +89,18 @@ class TrackedPairs:
         }
 
     def _pair(self, rng: np.random.Generator) -> tuple[TrackedView, TrackedView, Correspondences]:
-        if self.rehearsed and rng.uniform() < self.settings.pairs.rehearsed_share:
-            first, second, (points_a, points_b, valid) = self.rehearsed.pair(rng)
-            return _unlabelled(first), _unlabelled(second), Correspondences(points_a, points_b, valid, valid)
+        if self.replay and rng.uniform() < self.settings.pairs.replay_share:
+            first, second, (points_a, points_b, valid) = self.replay.pair(rng)
+            return _unlabeled(first), _unlabeled(second), Correspondences(points_a, points_b, valid, valid)
         chosen = int(np.searchsorted(self._cumulative, rng.uniform(0, self._cumulative[-1]), side="right"))
         frames = self.sequences[chosen]
         frame_a = int(rng.choice(self.useful[chosen]))
         a = frames.points(frame_a)
         frame_b, b = self._partner(rng, frames, frame_a, a)
         rows_a, rows_b = common_points(a, b)
+        if not len(rows_a):
+            view_a, view_b = self._anywhere(rng, frames, frame_a, a), self._anywhere(rng, frames, frame_b, b)
+            return view_a, view_b, self._two_frames(rng, view_a, view_b, rows_a, rows_b)
         middle = int(rng.integers(len(rows_a)))
         view_a = self._view(rng, frames, frame_a, a, a.points[rows_a[middle]])
         visible = inside(view_a.known.points[rows_a], self.settings.views.width, self.settings.views.height)
@@ -113,12 +114,12 @@ class TrackedPairs:
         self, rng: np.random.Generator, frames: LabeledFrames, frame_a: int, a: FramePoints
     ) -> tuple[int, FramePoints]:
         """Another frame, as far away as drawn or, where too few points are common, nearer; or the same one."""
-        settings = self.settings.pairs
+        settings, last = self.settings.pairs, len(frames) - 1
         if rng.uniform() < settings.same_frame_share:
             return frame_a, a
-        gap = settings.largest_gap * rng.uniform() ** (1 / (1 + settings.wide_baselines)) * rng.choice([-1, 1])
+        gap = self._gap(rng, frame_a, last)
         while abs(gap) >= 1:
-            frame_b = int(np.clip(frame_a + round(gap), 0, len(frames) - 1))
+            frame_b = int(np.clip(frame_a + round(gap), 0, last))
             if frame_b != frame_a:
                 b = frames.points(frame_b)
                 if len(common_points(a, b)[0]) >= settings.least_points:
@@ -126,24 +127,41 @@ class TrackedPairs:
             gap /= 2
         return frame_a, a
 
+    def _gap(self, rng: np.random.Generator, frame: int, last: int) -> float:
+        """Frames to another frame of a sequence that ends with frame `last`."""
+        settings = self.settings.pairs
+        if settings.wide_baselines:
+            distance = settings.largest_gap * rng.uniform() ** (1 / (1 + settings.wide_baselines))
+            return float(distance * rng.choice([-1, 1]))
+        window = np.arange(max(frame - settings.largest_gap, 0), min(frame + settings.largest_gap, last) + 1)
+        others = window[window != frame]
+        return float(rng.choice(others) - frame) if len(others) else 0.0
+
+    def _anywhere(self, rng: np.random.Generator, frames: LabeledFrames, frame: int, known: FramePoints) -> TrackedView:
+        """A view that looks at any known point of a frame."""
+        centre = known.points[rng.integers(len(known.points))] if len(known.points) else None
+        return self._view(rng, frames, frame, known, centre)
+
     def _view(
-        self, rng: np.random.Generator, frames: LabeledFrames, frame: int, known: FramePoints, centre: Float64
+        self, rng: np.random.Generator, frames: LabeledFrames, frame: int, known: FramePoints, centre: Float64 | None
     ) -> TrackedView:
         settings = self.settings
         width, height = settings.views.width, settings.views.height
         picture = frames.picture(frame)
         H = random_view(rng, settings.views, frames.size, centre)
         image = augment(warp_image(picture, H, width, height), rng, settings.photometric)
-        visible = cv2.warpPerspective(np.ones_like(picture), H, (width, height), flags=cv2.INTER_NEAREST) > 0
+        mask = frames.mask(frame)
+        used = np.ones_like(picture) if mask is None else mask.astype(np.uint8)
+        visible = cv2.warpPerspective(used, H, (width, height), flags=cv2.INTER_NEAREST) > 0
         points = warp_points(H, known.points)
-        # unstable and unknown points: the detector may see them as it likes
+        # the detector loss ignores the cells of unstable and unknown points
         agreement = np.where(known.stability == STABLE, _CERTAIN, _UNDECIDED).astype(np.float32)
         cells = label_cells(points, agreement, visible, width, height, AdaptationSettings())
         if not settings.pairs.teach_detector:
             cells[:] = IGNORED
         if not settings.pairs.untracked_is_background:
             cells[cells == DUSTBIN] = IGNORED
-        return TrackedView(image, cells, replace(known, points=points), H)
+        return TrackedView(image, cells, replace(known, points=points), H, None if mask is None else visible)
 
     def _two_frames(
         self, rng: np.random.Generator, a: TrackedView, b: TrackedView, rows_a: Int64, rows_b: Int64
@@ -176,28 +194,37 @@ class TrackedPairs:
         frame_from_a = np.linalg.inv(a.view_from_frame)
         places_b = warp_points(b.view_from_frame @ frame_from_a, result.a)
         result.valid[:] = inside(places_b, width, height) & inside(warp_points(frame_from_a, result.a), *size)
+        result.valid[:] &= _on(a.used, result.a) & _on(b.used, places_b)
         result.b[:] = np.where(result.valid[:, None], places_b, 0)
         result.negative[:] = result.valid
         return result
 
     def _stability(self, rng: np.random.Generator, view: TrackedView) -> tuple[Float32, Int64]:
-        """Labelled points of the view: at most half of them unstable, then stable ones."""
+        """Labeled points (M, 2) of the view and 1 for stable, 0 for unstable: at most half of them unstable ones."""
         count = self.settings.pairs.stability_points
         points, codes = np.zeros((count, 2), np.float32), np.full(count, IGNORED, np.int64)
         known = view.known
-        labelled = inside(known.points, self.settings.views.width, self.settings.views.height) & known.seen
-        unstable = rng.permutation(np.flatnonzero(labelled & (known.stability == UNSTABLE)))[: count // 2]
-        stable = rng.permutation(np.flatnonzero(labelled & (known.stability == STABLE)))
+        labeled = inside(known.points, self.settings.views.width, self.settings.views.height) & known.seen
+        unstable = rng.permutation(np.flatnonzero(labeled & (known.stability == UNSTABLE)))[: count // 2]
+        stable = rng.permutation(np.flatnonzero(labeled & (known.stability == STABLE)))
         rows = np.concatenate([unstable, stable])[:count]
         points[: len(rows)] = known.points[rows]
         codes[: len(rows)] = known.stability[rows] == STABLE
         return points, codes
 
 
-def _unlabelled(view: View) -> TrackedView:
+def _unlabeled(view: View) -> TrackedView:
     """A view of a picture of which no stability is known."""
     nothing = FramePoints(np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0, np.int8), np.zeros(0, np.bool_))
     return TrackedView(view.image, view.cells, nothing, view.view_from_picture)
+
+
+def _on(used: NDArray[np.bool_] | None, points: NDArray[Any]) -> NDArray[np.bool_]:
+    """(N,) whether points (N, 2) lie on used pixels; NaN does not, nor what lies outside a mask."""
+    known = np.isfinite(points).all(axis=1)
+    if used is None:
+        return np.asarray(known)
+    return np.asarray(known & unmasked(np.where(known[:, None], points, -1).astype(np.float32), used))
 
 
 def _empty(count: int) -> Correspondences:

@@ -7,7 +7,6 @@ killed and continues from its checkpoint ends with the weights of one that was n
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import statistics
 import time
@@ -20,17 +19,17 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
-from torch import Tensor, distributed, nn
+from torch import Tensor, nn
 from torch.utils.data import DataLoader
-from tqdm import tqdm
 
-from improvo import files
-from improvo.errors import ImprovoError, InputError
-from improvo.training.distributed import Share
+from improvo import files, terminal
+from improvo.errors import ConfigError, ImprovoError, InputError
+from improvo.training.distributed import Process
+from improvo.training.metrics import METRICS, append_metrics, keep_metrics
 from improvo.training.settings import OptimiserSettings
+from improvo.training.stage import Stage
 
 CHECKPOINT = "checkpoint.pt"
-METRICS = "metrics.jsonl"
 
 
 class Batches(Protocol):
@@ -41,22 +40,18 @@ class Batches(Protocol):
     def __getitem__(self, step: int) -> dict[str, Any]: ...
 
 
-class Stage(nn.Module):
-    """What a training stage teaches: a network and its losses. Subclasses are the stages."""
-
-    network: nn.Module
-
-    def losses(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Named scalars of one batch; `loss` is the one that is minimised."""
-        raise NotImplementedError
-
-
 class DivergedError(ImprovoError):
     """The loss is no longer a number."""
 
 
 def choose_device(name: str) -> torch.device:
-    """`auto` is CUDA where there is one."""
+    """`auto` is CUDA where there is one.
+
+    Raises:
+        ConfigError: CUDA asked for where torch sees none.
+    """
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigError(f"setting `optimiser.device`: torch sees no CUDA device for `{name}`; use cpu or auto")
     return torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
 
 
@@ -72,6 +67,8 @@ def choose_precision(name: str, device: torch.device) -> torch.dtype:
 
 class Trainer:
     """Runs one stage.
+
+    The folder must be this process's alone (`improvo.folder_lock`).
 
     Args:
         stage: network and losses.
@@ -104,9 +101,8 @@ class Trainer:
             lr=settings.learning_rate,
             fused=True,
         )
-        self.share = Share.of_this_process()
-        if self.share.processes > 1 and not distributed.is_initialized():
-            distributed.init_process_group("nccl" if self.device.type == "cuda" else "gloo")
+        self.process = Process.current()
+        self.process.join(self.device.type)
         self.step = 0
         self.seconds = 0.0  # of training, over all runs
         self._warm = False
@@ -120,6 +116,8 @@ class Trainer:
         """
         path = self.folder / CHECKPOINT
         if not path.is_file():
+            if self.process.leads:
+                keep_metrics(self.folder / METRICS, 0)
             return False
         try:
             state = torch.load(path, map_location=self.device, weights_only=True)
@@ -132,11 +130,8 @@ class Trainer:
         except Exception as error:  # torch raises many kinds; none of them is worth a traceback
             reason = str(error).splitlines()[0]
             raise InputError(f"{path}: cannot be continued from ({reason}); choose a new output folder") from None
-        if not self.share.leads:
-            return True
-        metrics = self.folder / METRICS
-        rows = metrics.read_text().splitlines(keepends=True) if metrics.is_file() else []
-        files.write_text(metrics, "".join(row for row in rows if json.loads(row)["step"] <= self.step))
+        if self.process.leads:
+            keep_metrics(self.folder / METRICS, self.step)
         return True
 
     def save(self) -> None:
@@ -169,9 +164,8 @@ class Trainer:
         window_start = saved = time.monotonic()
         count, waiting = 0, 0.0
         loader = iter(self._loader())
-        bar = tqdm(desc="training", initial=self.step, total=None if self.allowed else self.settings.steps, unit="step",
-                   disable=not (progress and self.share.leads))  # fmt: skip
-        with bar:
+        total = None if self.allowed else self.settings.steps
+        with terminal.progress("training", "step", total, progress and self.process.leads, self.step) as shown:
             while self.step < self.settings.steps:
                 before = time.monotonic()
                 batch = next(loader)
@@ -180,7 +174,7 @@ class Trainer:
                     sums[name] = sums[name] + value if name in sums else value
                 self.step += 1
                 count += 1
-                bar.update()
+                shown.advance()
                 if self.step % self.settings.log_every and self.step < self.settings.steps:
                     continue
                 row = {name: float(value) / count for name, value in sums.items()}
@@ -191,13 +185,12 @@ class Trainer:
                 self._plan((now - window_start) / count)
                 sums, count, waiting, window_start = {}, 0, 0.0, now
                 last = self.step == self.settings.steps
-                if self.share.leads and (now - saved > 60 * self.settings.checkpoint_minutes or last):
+                if self.process.leads and (now - saved > 60 * self.settings.checkpoint_minutes or last):
                     self.save()
                     saved = now
                     if on_checkpoint:
                         on_checkpoint(self)
-        if self.share.processes > 1:
-            distributed.barrier()  # nobody goes on before the files are written
+        self.process.wait_for_all()  # nobody goes on before the files are written
         network: nn.Module = self.average.network
         return network.eval()
 
@@ -230,21 +223,11 @@ class Trainer:
             losses = self.stage.losses(batch)
         self.optimiser.zero_grad(set_to_none=True)
         losses["loss"].backward()
-        self._share_gradients()
+        self.process.average_gradients(self.stage.parameters())
         nn.utils.clip_grad_norm_(self.stage.parameters(), settings.clip_norm)
         self.optimiser.step()
         self._follow()
         return {name: value.detach() for name, value in losses.items()}
-
-    def _share_gradients(self) -> None:
-        """The mean gradient over all processes, which start from the same weights and so keep them equal."""
-        if self.share.processes == 1:
-            return
-        gradients = [p.grad for p in self.stage.parameters() if p.grad is not None]
-        flat = torch.cat([gradient.flatten() for gradient in gradients])
-        distributed.all_reduce(flat)
-        for gradient, mean in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
-            gradient.copy_(mean.view_as(gradient) / self.share.processes)
 
     def _rate(self, step: int) -> float:
         """Share of the learning rate: linear warm-up, constant, linear fall to zero over the last steps."""
@@ -283,7 +266,7 @@ class Trainer:
             )
 
     def _log(self, losses: dict[str, float], step_seconds: float, loading: float) -> None:
-        if not self.share.leads:
+        if not self.process.leads:
             return
         row = {
             "step": self.step,
@@ -292,5 +275,4 @@ class Trainer:
             "step_seconds": round(step_seconds, 4),
             "loading_share": round(loading, 4),
         }
-        with (self.folder / METRICS).open("a") as stream:
-            stream.write(json.dumps(row) + "\n")
+        append_metrics(self.folder / METRICS, row)

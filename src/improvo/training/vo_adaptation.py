@@ -2,31 +2,31 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 
 from improvo.errors import ConfigError
-from improvo.frontend.superpoint import SuperPoint, sample_descriptors, sample_stability
-from improvo.training.losses import detector_loss, info_nce_loss, stability_loss
+from improvo.frontend.superpoint import SuperPoint, sample_stability
+from improvo.training.losses import detector_loss, stability_loss
 from improvo.training.settings import OdometryTrainingSettings
-from improvo.training.trainer import Stage
+from improvo.training.stage import DescriptorStage
 
 
-class VOAdaptationStage(Stage):
-    """All three heads on both views of a pair; what the odometry does not know counts for nothing.
+class VOAdaptationStage(DescriptorStage):
+    """All three heads on both views of a pair. What the odometry does not know is ignored by every loss.
 
     Args:
-        stable_per_unstable: see `stability_loss`.
+        network: with a stability head.
+        settings: weights of the losses.
+        stable_per_unstable: see `stability_loss`; None does not balance the labels.
     """
 
-    def __init__(self, network: SuperPoint, settings: OdometryTrainingSettings, stable_per_unstable: float) -> None:
-        super().__init__()
-        self.network = network
+    def __init__(
+        self, network: SuperPoint, settings: OdometryTrainingSettings, stable_per_unstable: float | None
+    ) -> None:
+        super().__init__(network, settings.descriptor_loss, settings.masked_pixels)
         self.settings = settings
         self.stable_per_unstable = stable_per_unstable
-        self.log_scale = nn.Parameter(torch.tensor(math.log(20.0)))  # inverse temperature of the InfoNCE loss
         if settings.stability_alone:
             self.requires_grad_(False)
             self._head.requires_grad_(True)
@@ -47,14 +47,8 @@ class VOAdaptationStage(Stage):
             return {"loss": loss, "stability": loss}
         output = self.network(batch["images"])
         detector = detector_loss(output.detector_logits, batch["cells"], settings.detector)
-        with torch.autocast(output.descriptors.device.type, enabled=False):
-            first, second = output.descriptors.float().chunk(2)
-            points_a, points_b = batch["points_a"], batch["points_b"]
-            a, b = sample_descriptors(first, points_a), sample_descriptors(second, points_b)
-            descriptor = info_nce_loss(
-                a, b, points_a, points_b, batch["valid"], self.log_scale.exp().clamp(max=100), settings.masked_pixels,
-                negative=batch["negative"], group=len(a) if settings.negatives_across else 1,
-            )  # fmt: skip
+        pairs = len(batch["valid"])
+        descriptor = self.descriptor_loss(output.descriptors, batch, group=pairs if settings.negatives_across else 1)
         stability = self._stability(output.stability_logits, batch)
         total = settings.detector_weight * detector + settings.descriptor_weight * descriptor
         return {

@@ -11,10 +11,14 @@ import numpy as np
 
 from improvo.errors import InputError, MissingExtraError
 from improvo.evaluation.sources import best
+from improvo.frontend.masking import without_masked
 from improvo.sequences import Sequence
 from improvo.types import Features, Frame
+from improvo.untrusted.arrays import FAULTS, check_array, read_npz
+from improvo.untrusted.text import reason
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
+_ARRAYS = ("keypoints", "descriptors", "scores", "image_size")  # what is read of an export
 
 
 @dataclass(frozen=True)
@@ -22,10 +26,12 @@ class ExportedFeatures:
     """Features read from files.
 
     An image is found by the tail of its path, longest first (`redkitchen/frame-000000.color.png` before
-    `frame-000000.color.png`), by `SEQUENCE/000000` (number in the recording), or, if the export holds one sequence,
-    by `000000`. NPZ files have that name with `.npz` appended to or in place of the suffix; an HDF5 file has it as a
-    group. Keypoints (N, 2) are in pixels of the frame as delivered (undistorted, resized), centre of the top-left
-    pixel (0, 0); descriptors are (N, D), in HDF5 (D, N) as hloc writes them; scores (N,) are optional.
+    `frame-000000.color.png`), by `SEQUENCE/000000` or `SEQUENCE/000000.png` (number in the recording, as
+    `--export-images` writes it), or, if the export holds one sequence, by `000000` alone. Where the recording's own
+    names are other numbers, those are taken that more of the export fits. NPZ files have that name with `.npz` appended
+    to or in place of the suffix; an HDF5 file has it as a group. Keypoints (N, 2) are in pixels of the frame as
+    delivered (undistorted, resized), centre of the top-left pixel (0, 0); descriptors are (N, D), in HDF5 (D, N) as
+    hloc writes them; scores (N,) are optional.
     """
 
     path: str  # a folder, or an HDF5 file
@@ -61,12 +67,15 @@ class ExportedFeatures:
         """
         index = _index(self.path)
         names = candidate_names(sequence.name, frame, self.one_sequence)
+        if _is_another_number(frame) and _numbered_by_index(self.path, index, sequence):
+            names.sort(key=lambda name: PurePath(name).stem != f"{frame.source_index:06d}")
         found = next((name for name in names if name in index.names), None)
         if found is None:
             raise InputError(f"{self.path}: has no features for {frame.source} (looked for {names[0]}); export it")
         arrays = _read_hdf5(self.path, found) if index.hdf5 else _read_npz(Path(self.path) / found)
         where = f"{self.path}: {found}"
-        return best(to_features(arrays, where, (sequence.camera.width, sequence.camera.height)), self.max_keypoints)
+        exported = to_features(arrays, where, (sequence.camera.width, sequence.camera.height))
+        return best(without_masked(exported, frame.mask), self.max_keypoints)
 
 
 @dataclass(frozen=True)
@@ -92,6 +101,21 @@ def _index(path: str) -> _Index:
     return _Index(names, place.suffix in HDF5_SUFFIXES)
 
 
+def _is_another_number(frame: Frame) -> bool:
+    """Whether the frame's file is named by a number that is not that of the frame."""
+    stem = PurePath(frame.source).stem
+    return stem.isdecimal() and stem.lstrip("0") != (str(frame.source_index) if frame.source_index else "")
+
+
+@lru_cache(maxsize=16)
+def _numbered_by_index(path: str, index: _Index, sequence: Sequence) -> bool:
+    """Whether the names in an export are frame numbers, rather than the recording's own names."""
+    stems = {PurePath(name).stem for name in index.names}
+    own = sum(PurePath(sequence.recording.source(int(row))).stem in stems for row in range(len(sequence.recording)))
+    counted = sum(f"{row:06d}" in stems for row in range(len(sequence.recording)))
+    return counted > own
+
+
 def candidate_names(sequence_name: str, frame: Frame, one_sequence: bool) -> list[str]:
     """Names under which the features of a frame may be filed, most specific first.
 
@@ -108,7 +132,9 @@ def candidate_names(sequence_name: str, frame: Frame, one_sequence: bool) -> lis
     bare = [parts[-1], f"{frame.source_index:06d}"] if one_sequence else []
     names: list[str] = []
     for stem in (*numbered, *tails, *bare):
-        for name in (stem, f"{stem}.npz", str(PurePath(stem).with_suffix(".npz"))):
+        # a number alone is also filed as the picture that `--export-images` writes under it, as hloc keeps it
+        pictures = [f"{stem}{suffix}" for suffix in (".png", ".jpg")] if stem.rsplit("/", 1)[-1].isdigit() else []
+        for name in (stem, *pictures, f"{stem}.npz", str(PurePath(stem).with_suffix(".npz"))):
             if name not in names:
                 names.append(name)
     return names
@@ -128,19 +154,23 @@ def to_features(arrays: dict[str, Any], where: str, image_size: tuple[int, int])
     missing = {"keypoints", "descriptors"} - set(arrays)
     if missing:
         raise InputError(f"{where}: lacks `{sorted(missing)[0]}`; see docs/evaluation.md for the layout")
-    keypoints, descriptors = np.asarray(arrays["keypoints"], np.float32), np.asarray(arrays["descriptors"])
-    scores = np.asarray(arrays.get("scores", -np.arange(len(keypoints))), np.float32)
-    count = len(keypoints)
+    try:
+        keypoints, descriptors = np.asarray(arrays["keypoints"], np.float32), np.asarray(arrays["descriptors"])
+        count = len(keypoints)
+        scores = np.asarray(arrays.get("scores", -np.arange(count)), np.float32)
+        size = tuple(int(side) for side in np.ravel(arrays.get("image_size", image_size)))
+        if descriptors.dtype != np.uint8:
+            descriptors = descriptors.astype(np.float32)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{where}: holds something else than numbers ({reason(error)}); export it again") from None
     if keypoints.shape != (count, 2) or descriptors.ndim != 2 or len(descriptors) != count or scores.shape != (count,):
         shapes = f"keypoints {keypoints.shape}, descriptors {descriptors.shape}, scores {scores.shape}"
         raise InputError(f"{where}: shapes do not fit ({shapes}); they are (N, 2), (N, D) and (N,)")
-    size = tuple(int(side) for side in np.ravel(arrays.get("image_size", image_size)))
     if size != image_size:
         raise InputError(
             f"{where}: was exported from {size} images, the frames are {image_size}; export from the frames"
         )
     if descriptors.dtype != np.uint8:
-        descriptors = descriptors.astype(np.float32)
         descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-12)
     if not (np.isfinite(keypoints).all() and np.isfinite(scores).all() and np.isfinite(descriptors).all()):
         raise InputError(f"{where}: holds NaN or infinite values; export it again")
@@ -149,9 +179,8 @@ def to_features(arrays: dict[str, Any], where: str, image_size: tuple[int, int])
 
 def _read_npz(path: Path) -> dict[str, Any]:
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, KeyError) as error:
+        return dict(read_npz(path, _ARRAYS.__contains__))
+    except ValueError as error:
         raise InputError(f"{path}: cannot be read as NPZ ({error}); export it again") from None
 
 
@@ -168,14 +197,27 @@ def _hdf5(path: str) -> Any:
 
 def _hdf5_names(path: str) -> frozenset[str]:
     names: list[str] = []
-    with _hdf5(path) as file:
-        file.visititems(lambda name, node: names.append(name) if "keypoints" in getattr(node, "keys", list)() else None)
+    try:
+        with _hdf5(path) as file:
+            file.visititems(
+                lambda name, node: names.append(name) if "keypoints" in getattr(node, "keys", list)() else None
+            )
+    except FAULTS as error:
+        raise InputError(f"{path}: is damaged ({reason(error)}); export it again") from None
     return frozenset(names)
 
 
 def _read_hdf5(path: str, name: str) -> dict[str, Any]:
-    with _hdf5(path) as file:
-        arrays = {key: np.asarray(value) for key, value in file[name].items()}
+    arrays = {}
+    try:
+        with _hdf5(path) as file:
+            for key in _ARRAYS:
+                if key in file[name]:
+                    value = file[name][key]
+                    check_array(key, value.shape, value.dtype.itemsize)
+                    arrays[key] = np.asarray(value)
+    except FAULTS as error:
+        raise InputError(f"{path}: {name}: cannot be read ({reason(error)}); export it again") from None
     if "descriptors" in arrays:
         arrays["descriptors"] = arrays["descriptors"].T
     return arrays

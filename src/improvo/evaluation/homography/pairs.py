@@ -10,6 +10,8 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.evaluation.settings import HomographySettings
+from improvo.sequences.base import UnreadableFrameError
+from improvo.sequences.images import read_grey
 from improvo.training.settings import ViewSettings
 from improvo.training.views import random_view, warp_image
 from improvo.types import Float64, UInt8
@@ -107,9 +109,10 @@ def _read_image(path: str, longest_side: int) -> tuple[UInt8, Float64]:
     """Grey image of at most `longest_side`, and the homography (3, 3) from the file's pixels to its pixels."""
     import cv2
 
-    image = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise InputError(f"{path}: cannot be read as an image; remove or replace it")
+    try:
+        image = read_grey(Path(path))
+    except UnreadableFrameError as error:
+        raise InputError(f"{path}: cannot be read as an image ({error}); remove or replace it") from None
     height, width = image.shape
     scale = longest_side / max(height, width)
     if scale >= 1:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,10 @@ from numpy.typing import NDArray
 
 from improvo.continuation import first_difference
 from improvo.errors import InputError, OutputError
+from improvo.files import temporary_name
 from improvo.types import Features, Float32, Int64
+from improvo.untrusted.arrays import FAULTS
+from improvo.untrusted.text import load_json
 
 FORMAT = 1
 _ARRAYS = ("keypoints", "descriptors", "scores", "stability")
@@ -58,7 +60,7 @@ def read_cache(folder: Path, fingerprint: dict[str, Any] | None = None) -> Featu
     if not index_file.is_file():
         return None
     try:
-        index = json.loads(index_file.read_text())
+        index = load_json(index_file.read_text(encoding="utf-8"))
         made_with, frames, ends = index["fingerprint"], index["frames"], index["ends"]
         format_version = index["format"]
         arrays = {
@@ -67,7 +69,12 @@ def read_cache(folder: Path, fingerprint: dict[str, Any] | None = None) -> Featu
             if (folder / f"{name}.npy").is_file()
         }
         keypoints, descriptors, scores = arrays["keypoints"], arrays["descriptors"], arrays["scores"]
-    except (OSError, ValueError, KeyError, TypeError):
+        rows = _rows(frames, ends, len(keypoints))
+        whole = keypoints.shape[1:] == (2,) and descriptors.ndim == 2 and scores.ndim == 1
+        whole &= all(len(array) == len(keypoints) and array.dtype.kind in "fu" for array in arrays.values())
+        if not whole or not isinstance(made_with, dict):
+            raise ValueError("arrays that do not belong together")
+    except FAULTS:
         raise InputError(f"{folder}: is a damaged feature cache; delete that folder") from None
     now = made_with if fingerprint is None else json.loads(json.dumps(fingerprint))
     difference = first_difference({"format": format_version, **made_with}, {"format": FORMAT, **now})
@@ -75,11 +82,19 @@ def read_cache(folder: Path, fingerprint: dict[str, Any] | None = None) -> Featu
         raise InputError(
             f"{folder}: features were cached with {difference}; delete that folder, or give another output folder"
         )
-    if not len(keypoints) == len(descriptors) == len(scores) == (ends[-1] if ends else 0):
-        raise InputError(f"{folder}: is a damaged feature cache; delete that folder")
-    starts = [0, *ends[:-1]]
-    rows = {int(frame): (start, end) for frame, start, end in zip(frames, starts, ends, strict=True)}
     return FeatureCache(rows, keypoints, descriptors, scores, arrays.get("stability"))
+
+
+def _rows(frames: list[int], ends: list[int], count: int) -> dict[int, tuple[int, int]]:
+    """First and last + 1 row of each frame.
+
+    Raises:
+        ValueError: they are not those of `count` rows.
+    """
+    bounds = np.array([0, *ends])
+    if bounds.dtype.kind != "i" or (np.diff(bounds) < 0).any() or bounds[-1] != count:
+        raise ValueError("rows out of order")
+    return {int(frame): (int(a), int(b)) for frame, a, b in zip(frames, bounds[:-1], bounds[1:], strict=True)}
 
 
 def write_cache(folder: Path, fingerprint: dict[str, Any], features: dict[int, Features]) -> None:
@@ -97,7 +112,8 @@ def write_cache(folder: Path, fingerprint: dict[str, Any], features: dict[int, F
     ends: Int64 = np.cumsum([len(features[frame]) for frame in frames]).astype(np.int64)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        temporary = folder.with_name(temporary_name(folder.name))
+        temporary.mkdir()
         try:
             for name in _ARRAYS:
                 parts = [getattr(features[frame], name) for frame in frames]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from pathlib import Path
 
 import cv2
@@ -11,7 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from improvo.errors import InputError
+from improvo.sequences.base import UnreadableFrameError
+from improvo.sequences.images import read_grey
 from improvo.types import Float32, Int64, UInt8
+from improvo.untrusted.text import load_json
 
 STATIC = 0
 # Where the labels around a keypoint differ, the first of these is its cause.
@@ -31,12 +33,13 @@ class TrueCauses:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         try:
-            self.codes: dict[str, int] = dict(json.loads((folder / "simulation.json").read_text())["causes"])
+            self.codes: dict[str, int] = dict(load_json((folder / "simulation.json").read_text())["causes"])
         except (OSError, ValueError, KeyError, TypeError):
             raise InputError(
                 f"{folder}: has no readable simulation.json; give a folder made by `improvo simulate`"
             ) from None
-        if set(self.codes) != set(PRECEDENCE):
+        whole = all(isinstance(code, int) and 0 <= code < 256 for code in self.codes.values())
+        if set(self.codes) != set(PRECEDENCE) or not whole:
             raise InputError(f"{folder}/simulation.json: other causes than {', '.join(PRECEDENCE)}; simulate it again")
         self._rank = np.full(256, len(PRECEDENCE) - 1, np.uint8)
         for rank, name in enumerate(PRECEDENCE):
@@ -46,9 +49,10 @@ class TrueCauses:
     def image(self, frame: int) -> UInt8:
         """Rank of the cause in `PRECEDENCE` per pixel (H, W) of frame `frame` of the recording."""
         path = self.folder / "labels" / f"{frame:06d}.png"
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise InputError(f"{path}: is missing or no image; simulate the recording again")
+        try:
+            image = read_grey(path)
+        except UnreadableFrameError as error:
+            raise InputError(f"{path}: is missing or no image ({error}); simulate the recording again") from None
         return np.asarray(self._rank[image], np.uint8)
 
     def at(self, frame: int, keypoints: Float32, width: int, reach: int = 1) -> NDArray[np.uint8]:

@@ -13,7 +13,6 @@ accident.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from improvo.evaluation.stability.causes import PRECEDENCE, TrueCauses, track_ca
 from improvo.evaluation.stability.true_errors import true_track_errors
 from improvo.evaluation.statistics import average_precision
 from improvo.types import Float32, Float64, Int64
+from improvo.untrusted.text import read_json_file
 
 HEADLINE = ("moving", "highlight")
 LEFT_PLACE_PX = 5.0  # distance from where a static point would be: wrongly linked, or the thing moved
@@ -265,9 +265,9 @@ def _processed(labels: Path, frames: int, truth: TrueCauses) -> tuple[NDArray[np
     if not (labels / "run.json").is_file():
         return np.arange(frames), width
     try:
-        report = json.loads((labels / "run.json").read_text())
+        report = read_json_file(labels / "run.json", "run the sequence again")
         return np.asarray(report["frames"]["source_index"], np.int64), int(report["camera"]["width"])
-    except (ValueError, KeyError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, OverflowError):
         raise InputError(f"{labels / 'run.json'}: is damaged; run the sequence again") from None
 
 

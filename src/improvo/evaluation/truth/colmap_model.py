@@ -15,6 +15,7 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, colmap_calibration
 from improvo.geometry.se3 import rigid, rotation_from_quat_xyzw
+from improvo.geometry.text_files import read_text
 from improvo.types import Float64
 
 # COLMAP's model numbers, with the number of parameters
@@ -79,7 +80,7 @@ _Image = tuple[str, int, tuple[float, ...], tuple[float, ...]]  # name, camera, 
 
 def _text_cameras(folder: Path) -> dict[int, Calibration]:
     path = folder / "cameras.txt"
-    rows = [line.split() for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    rows = [line.split() for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
     return {
         int(row[0]): colmap_calibration(str(path), row[1], (int(row[2]), int(row[3])), [float(v) for v in row[4:]])
         for row in rows
@@ -88,7 +89,7 @@ def _text_cameras(folder: Path) -> dict[int, Calibration]:
 
 def _text_images(folder: Path) -> list[_Image]:
     """Every second line is a pose, and the one after it the observations, which may be empty."""
-    lines = [line for line in (folder / "images.txt").read_text().splitlines() if not line.startswith("#")]
+    lines = [line for line in read_text(folder / "images.txt").splitlines() if not line.startswith("#")]
     found: list[_Image] = []
     for line in lines[::2]:
         if not line.strip():

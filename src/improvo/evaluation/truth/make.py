@@ -27,6 +27,7 @@ from improvo.geometry.se3 import inverse
 from improvo.sequences import Sequence
 from improvo.sequences.base import UnreadableFrameError
 from improvo.types import Float32, Float64, Int64
+from improvo.untrusted.text import read_json_file
 
 COMMAND = "truth"
 _DECIDING = ("max_features", "overlap", "farthest", "calibrate", "seed")  # settings that decide the reconstruction
@@ -158,8 +159,9 @@ def _working_folder(output: Path, sequence: Sequence, settings: TruthSettings) -
         "settings": {name: getattr(settings, name) for name in _DECIDING},
     }
     request = folder / "request.json"
-    if request.is_file() and json.loads(request.read_text()) != json.loads(json.dumps(wanted)):
-        raise InputError(f"{folder}: was begun with other frames or settings; delete that folder to begin anew")
+    mend = "delete that folder to begin anew"
+    if request.is_file() and read_json_file(request, mend) != json.loads(json.dumps(wanted)):
+        raise InputError(f"{folder}: was begun with other frames or settings; {mend}")
     write_json(request, wanted)
     return folder
 

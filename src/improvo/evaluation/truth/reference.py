@@ -14,6 +14,7 @@ from improvo.files import write_text
 from improvo.geometry.camera import Camera
 from improvo.geometry.camera_files import Calibration
 from improvo.geometry.se3 import inverse, quat_xyzw_from_rotation, rigid, rotation_from_quat_xyzw
+from improvo.geometry.text_files import decoded, read_text
 from improvo.geometry.trajectory_files import clean_poses, read_trajectory
 from improvo.types import Float64, Int64
 
@@ -47,11 +48,7 @@ def read_reference(path: Path | str) -> ReferencePoses:
         model = read_colmap_model(path)
         world_from_cam = inverse(model.cam_from_world)
         return ReferencePoses(str(path), world_from_cam, names=model.names, calibration=model.calibration)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise InputError(f"{path}: cannot be read as true poses ({reason}); give {_FORMATS}") from None
+    lines = read_text(path, "true poses", f"give {_FORMATS}").splitlines()
     numbered = _numbered(lines, path)
     if numbered is not None:
         return numbered
@@ -65,7 +62,7 @@ def lacks_times(path: Path) -> bool:
     if path.is_dir():
         return is_colmap_model(path)
     try:
-        return _numbered(path.read_text(encoding="utf-8").splitlines(), path) is not None
+        return _numbered(decoded(path.read_bytes()).splitlines(), path) is not None
     except (OSError, UnicodeDecodeError):
         return False
 

@@ -13,6 +13,7 @@ from improvo.evaluation.settings import TrajectorySettings
 from improvo.evaluation.sources import Recorded
 from improvo.evaluation.trajectory.protocol import AlignedSegment, aligned_segments, clean_truth, errors_over_windows
 from improvo.evaluation.trajectory.protocol import evaluate_trajectory as evaluate
+from improvo.frontend.masking import features_of
 from improvo.frontend.registry import load_frontend
 from improvo.jobs.pool import Workers
 from improvo.odometry.settings import OdometrySettings
@@ -64,7 +65,7 @@ def run_vo(task: VoTask) -> list[VoOutcome]:
     """
     sequence = task.source.open()
     frontend = load_frontend(task.frontend, task.max_keypoints)
-    detected = [(frame.time, frontend(frame.image)) for frame in sequence]
+    detected = [(frame.time, features_of(frontend, frame)) for frame in sequence]
     has_head = any(features.stability is not None for _, features in detected)
     outcomes = []
     for variant in (WITHOUT, WITH) if has_head else ("",):

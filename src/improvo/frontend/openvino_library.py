@@ -1,0 +1,36 @@
+"""OpenVINO, imported without its telemetry: the one place that imports it, in every process.
+
+Left to itself, `import openvino` writes a client id into the user's home folder, counts how often it was imported, and
+reports it to a web service. It does so through a package of its own, `openvino_telemetry`, and goes without where that
+is not installed; so it is hidden while OpenVINO loads. A program that has imported OpenVINO before us is left alone.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+_TELEMETRY = "openvino_telemetry"
+
+
+@contextmanager
+def _hidden(name: str) -> Iterator[None]:
+    """Meanwhile `import NAME` fails, as if it was not installed."""
+    missing = object()
+    before = sys.modules.get(name, missing)
+    sys.modules[name] = None  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        if before is missing:
+            del sys.modules[name]
+        else:
+            sys.modules[name] = before  # type: ignore[assignment]
+
+
+with _hidden(_TELEMETRY):
+    import openvino
+    from openvino import opset13
+
+__all__ = ["openvino", "opset13"]

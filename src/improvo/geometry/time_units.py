@@ -1,0 +1,38 @@
+"""Time stamps in seconds, whatever unit they were written in: seconds, milliseconds, microseconds or nanoseconds.
+
+The unit is told by size. A date between 1990 and 2100 fits one unit only. Stamps that count from another start are
+whole numbers in units other than seconds, and the step between frames tells which.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from improvo.types import Float64
+
+UNITS = {"seconds": 1.0, "milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
+_DATES = (6.3e8, 4.2e9)  # seconds since 1970: 1990 to 2100
+# the smallest median step of whole numbers that is read as this unit
+_STEPS = (("nanoseconds", 4e6), ("microseconds", 4e3), ("milliseconds", 400.0))
+
+
+def in_seconds(stamps: Float64) -> tuple[Float64, str | None]:
+    """Stamps (N,) in seconds, and the name of their unit where it was another."""
+    unit = unit_of(stamps)
+    return (stamps, None) if unit == "seconds" else (stamps / UNITS[unit], unit)
+
+
+def unit_of(stamps: Float64) -> str:
+    """The unit that stamps (N,) are in, by their size; `seconds` where nothing speaks against it."""
+    finite = stamps[np.isfinite(stamps)]
+    if len(finite) == 0:
+        return "seconds"
+    middle = float(np.median(finite))
+    for unit, scale in UNITS.items():
+        if _DATES[0] <= middle / scale <= _DATES[1]:
+            return unit
+    steps = np.diff(np.unique(finite))
+    if len(steps) == 0 or (finite != np.rint(finite)).any():
+        return "seconds"
+    step = float(np.median(steps))
+    return next((unit for unit, least in _STEPS if step >= least), "seconds")

@@ -1,0 +1,89 @@
+"""What the odometry is given, looked at before anything of it changes: pictures and features that cannot be used."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from improvo.errors import InputError
+from improvo.geometry.camera import Camera
+from improvo.types import Features, Frame
+
+
+def check_frame(frame: Frame, camera: Camera) -> None:
+    """Refuse a picture that is not what the camera makes.
+
+    Raises:
+        InputError: it has another size or type, or the time is no number.
+    """
+    image: Any = frame.image
+    wanted = f"this odometry reads uint8 pictures of {camera.width}x{camera.height}, those of its camera"
+    if not isinstance(image, np.ndarray):
+        raise InputError(f"{frame.source}: the picture is a {type(image).__name__}; {wanted}, as NumPy arrays (H, W)")
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+        raise InputError(f"{frame.source}: the picture has the shape {image.shape}; {wanted}, (H, W) or (H, W, 3)")
+    if image.dtype != np.uint8:
+        mend = "multiply by 255 and convert" if image.dtype.kind == "f" else "scale its values to 0 to 255 and convert"
+        raise InputError(f"{frame.source}: the picture is of type {image.dtype}; {wanted}: {mend}")
+    if image.shape[:2] != (camera.height, camera.width):
+        own = f"{image.shape[1]}x{image.shape[0]}"
+        mend = "resize it, or make a new VisualOdometry with `camera.resized(width, height)`"
+        raise InputError(f"{frame.source}: the picture has {own} pixels; {wanted}: {mend}")
+    check_time(frame.time)
+
+
+def check_time(time: float) -> None:
+    """Refuse a time that is not a number of seconds.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not math.isfinite(time):
+        raise InputError(f"time {time}: a frame needs a finite time in seconds")
+
+
+def check_features(features: Features, width: int | None) -> None:
+    """Refuse features whose arrays do not belong together.
+
+    Args:
+        features: of a frame.
+        width: of the descriptors of the frame before; None for the first.
+
+    Raises:
+        InputError: shapes that do not fit, other descriptors than before, or places that are no numbers.
+    """
+    count = len(features.keypoints)
+    shapes = f"keypoints {features.keypoints.shape}, descriptors {features.descriptors.shape}"
+    per_point = [features.descriptors, features.scores, *([] if features.stability is None else [features.stability])]
+    if features.keypoints.shape != (count, 2) or any(len(one) != count for one in per_point):
+        raise InputError(f"features: the arrays do not fit ({shapes}); they are (N, 2), (N, D), (N,)")
+    if features.descriptors.ndim != 2 or (width is not None and features.descriptors.shape[1] != width):
+        raise InputError(f"features: {shapes}, where the frame before had {width} columns; use one frontend throughout")
+    if not (np.isfinite(features.keypoints).all() and np.isfinite(features.weights()).all()):
+        raise InputError("features: places or stabilities are NaN or infinite; mend the frontend")
+
+
+class OneThread:
+    """Lets in one thread at a time, and tells any other so instead of letting it wait."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """The block is run by one thread; that thread may enter again.
+
+        Raises:
+            RuntimeError: another thread is within.
+        """
+        if not self._lock.acquire(blocking=False):
+            raise RuntimeError("another thread is tracking with this VisualOdometry; make one for each thread")
+        try:
+            yield
+        finally:
+            self._lock.release()

@@ -1,0 +1,28 @@
+"""Names of files that no system takes, said before anything is done with them."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+from improvo.errors import InputError
+
+_REASONS = {errno.ENAMETOOLONG: "the name is too long", errno.ELOOP: "is a link that leads to itself"}
+
+
+def check_path(path: Path) -> Path:
+    """The path, if the system can look it up; whether something is there does not matter.
+
+    Raises:
+        InputError: it holds NUL, is too long, or is a loop of links.
+    """
+    try:
+        os.stat(path)
+    except ValueError:  # NUL, or characters that the system's encoding lacks
+        raise InputError(f"{str(path)!r}: is no name that a file can have; check the path") from None
+    except OSError as error:
+        if error.errno in _REASONS:
+            shown = str(path) if len(str(path)) <= 100 else f"{str(path)[:97]}..."
+            raise InputError(f"{shown}: {_REASONS[error.errno]}; check the path") from None
+    return path
