@@ -125,7 +125,7 @@ def test_a_finished_run_is_left_as_it_is_and_more_rounds_go_on_from_it(
     assert run(out, [walk], again, rounds=1).best == result.best  # fewer rounds do not undo the others
     assert again.calls == []
     changed = {path.name for path, when in before.items() if path.stat().st_mtime_ns != when}
-    assert changed <= {".improvo.json", "report.html"}
+    assert changed <= {".improvo.json", ".improvo.lock", "report.html"}
 
 
 def test_other_settings_are_refused_and_what_a_kill_left_is_cleared_away(
