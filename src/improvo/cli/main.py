@@ -8,6 +8,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from improvo import __version__
 from improvo.cli import output
@@ -27,6 +28,14 @@ class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
         if action.default in (None, False, []) or "(default" in (action.help or ""):
             return action.help
         return super()._get_help_string(action)
+
+
+class _Parser(argparse.ArgumentParser):
+    """Errors are one line, without the usage, which is long for commands with many options."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the error and exit with status 2."""
+        self.exit(2, f"{self.prog}: {message}; `{self.prog} --help` shows the options\n")
 
 
 class _Text(HelpFormatter, argparse.RawDescriptionHelpFormatter):
@@ -78,7 +87,7 @@ def cache_folder() -> Path:
 
 def parser_for(words: Sequence[str]) -> argparse.ArgumentParser:
     """The parser of all commands; only the module of the one that `words` name is imported."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="improvo",
         description="Self-improving visual odometry: video in; a trajectory, a map and a better frontend out.",
         epilog=_EPILOG,
