@@ -92,7 +92,8 @@ def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: in
     axis.set_aspect("equal")
     axis.grid(color="white", alpha=0.12, linewidth=0.6)
     axis.tick_params(labelsize=8)
-    axis.set_xlabel("right of the first camera (map units: the first median depth is 1)", fontsize=8)
+    unit = "metres" if run.unit.startswith("metres") else "map units: the first median depth is 1"
+    axis.set_xlabel(f"right of the first camera ({unit})", fontsize=8)
     axis.set_ylabel("ahead of the first camera", fontsize=8)
     axis.set_title(_title(run, len(shown), int((~inside).sum())), fontsize=10)
     _time_bar(figure, axis, palette, run.frames, len(last))
@@ -116,7 +117,8 @@ def _title(run: RunFolder, points: int, outside: int) -> str:
     if outside:
         parts.append(f"{outside} far ones outside the picture")
     if len(segments) > 1:
-        parts.append(f"{len(segments)} segments, each with its own scale, placed by guess")
+        own = "" if run.unit.startswith("metres") else "each with its own scale, "
+        parts.append(f"{len(segments)} segments, {own}placed by guess")
     return f"{run.name}, {Path(run.report['frontend']).name}, seen from above\n" + "; ".join(parts)
 
 

@@ -44,7 +44,7 @@ class KittiRaw(Recording):
         if stamps_file.is_file() and settings.fps is None:
             times, _ = read_times(stamps_file)
             # a lost picture still has a time stamp, so files are numbered by row
-            rows = np.array([int(file.stem) if file.stem.isdigit() else len(times) for file in files])
+            rows = np.array([len(times) if number_of(file.stem) is None else number_of(file.stem) for file in files])
             if (rows >= len(times)).any():
                 raise InputError(
                     f"{stamps_file}: has {len(times)} times for {len(files)} images; repair it or give --fps"

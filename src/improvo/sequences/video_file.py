@@ -20,6 +20,7 @@ from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameE
 from improvo.sequences.rates import DEFAULT_FPS
 from improvo.sequences.video_codec import is_script, why_unreadable
 from improvo.types import Int64, UInt8
+from improvo.untrusted.paths import is_text
 
 VIDEO_SUFFIXES = frozenset(
     {
@@ -57,6 +58,8 @@ class VideoFile(Recording):
         self._capture: cv2.VideoCapture | None = None
         if not path.is_file():
             raise InputError(f"{path}: is no video file")
+        if not is_text(path.absolute()):
+            raise InputError(f"{path}: the name is no text, which the video decoder cannot open; rename it")
         if path.stat().st_size == 0:
             raise InputError(f"{path}: the file is empty; copy the video again")
         if is_script(path):
