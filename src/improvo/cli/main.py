@@ -18,7 +18,7 @@ from improvo.jobs.interrupts import termination_interrupts
 
 _EPILOG = """\
 `improvo VERB --help` shows a command's options with their defaults.
-Exit status: 0 done, 2 an error that you can mend (one line says how), 130 interrupted, 1 a bug of improvo."""
+Exit status: 0 done, 2 an error that you can correct (one line says how), 130 interrupted, 1 a bug of improvo."""
 
 
 class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
@@ -43,7 +43,7 @@ class _Text(HelpFormatter, argparse.RawDescriptionHelpFormatter):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point. Returns the exit status: 0 done, 2 an error that the user can mend, 130 interrupted."""
+    """Entry point. Returns the exit status: 0 done, 2 an error that the user can correct, 130 interrupted."""
     words = list(sys.argv[1:] if argv is None else argv)
     os.environ.setdefault("MPLCONFIGDIR", str(cache_folder() / "matplotlib"))  # made by matplotlib, if it is used
     try:
@@ -100,9 +100,7 @@ def parser_for(words: Sequence[str]) -> argparse.ArgumentParser:
     return parser
 
 
-def _add_commands(
-    parsers: argparse._SubParsersAction[argparse.ArgumentParser], commands: dict[str, Command], named: list[str]
-) -> None:
+def _add_commands(parsers: argparse._SubParsersAction[_Parser], commands: dict[str, Command], named: list[str]) -> None:
     for name, command in commands.items():
         chosen = named[:1] == [name]
         leaf = chosen and not command.parts
