@@ -34,7 +34,7 @@ from improvo.stability.tables import POINTS_FILE, read_points
 from improvo.types import Float64, Trajectory, UInt8
 
 FRAMES = 36
-MARKER = 0.3  # metres
+MARKER = 0.8  # metres
 SIZE = 1.7  # the room is this much larger than `rendered_walk` has it, so that nothing is right by chance
 WALLS = (  # corner and edges of each: back, floor, right, left, a small panel with the marker
     ((-4.0, -2.0, 4.5), (8.0, 0.0, 0.0), (0.0, 3.0, 0.0)),
@@ -80,7 +80,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def up_to_scale(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output folder of a run without a scale; not to be written to."""
     out = tmp_path_factory.mktemp("run") / "out"
-    assert main(["run", str(room), "-o", str(out), "--frontend", "orb", "--max-keypoints", "600", "--quiet"]) == 0
+    assert main(["run", str(room), "-o", str(out), "--frontend", "sift", "--max-keypoints", "800", "--quiet"]) == 0
     return out
 
 
@@ -112,11 +112,11 @@ def heights(sequence: Sequence) -> Float64:
 
 
 SOURCES: dict[str, tuple[Callable[[Sequence], ScaleSettings], float]] = {
-    "depth": (lambda sequence: ScaleSettings("depth"), 0.04),
+    "depth": (lambda sequence: ScaleSettings("depth"), 0.03),
     "truth": (lambda sequence: ScaleSettings("truth"), 1e-6),
     "distance": (lambda sequence: ScaleSettings("distance", distance_between(sequence, 3, 33), (3, 33)), 0.03),
     "height": (lambda sequence: ScaleSettings("height", float(np.median(heights(sequence)))), 0.05),
-    "marker": (lambda sequence: ScaleSettings("marker", MARKER), 0.05),
+    "marker": (lambda sequence: ScaleSettings("marker", MARKER), 0.03),
 }
 
 
@@ -146,14 +146,12 @@ def test_every_source_gives_the_true_size_in_every_output(source: str, finished:
 
 def test_the_command_writes_metres_everywhere(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    given = ["run", str(room), "-o", str(out), "--frontend", "orb", "--max-keypoints", "600", "--max-frames", "24"]
+    given = ["run", str(room), "-o", str(out), "--frontend", "sift", "--max-keypoints", "800", "--max-frames", "24"]
     assert main([*given, "--scale", "marker", str(MARKER), "--dense", "--report"]) == 0
     text = capsys.readouterr().out
     assert "unit: metres, from markers of known size" in text
-    assert (
-        abs(error_of_size(read_trajectory(out / "trajectory.txt"), open_sequence(room, max_frames=24).ground_truth))
-        < 0.02
-    )
+    truth = open_sequence(room, max_frames=24).ground_truth
+    assert abs(error_of_size(read_trajectory(out / "trajectory.txt"), truth)) < 0.05
     report = json.loads((out / "run.json").read_text())
     assert report["configuration"]["scale"]["metres"] == MARKER
     assert b"dense points, metres" in (out / "dense.ply").read_bytes()[:200]

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from improvo.labeling.labeler import LabeledRun
     from improvo.labeling.store import SequenceRecord
     from improvo.odometry.run_settings import RunSettings
+    from improvo.odometry.scale.settings import ScaleSettings
     from improvo.sequences import Sequence as ImageSequence
     from improvo.sequences import SequenceSettings
     from improvo.training.settings import OdometryTrainingSettings
@@ -33,6 +34,7 @@ def run(
     output: PathLike,
     settings: RunSettings | None = None,
     frontend: Frontend | None = None,
+    scale: ScaleSettings | None = None,
 ) -> LabeledRun:
     """Visual odometry on one sequence, as `improvo run` does it.
 
@@ -51,6 +53,8 @@ def run(
     from improvo.depth.run_settings import DenseRunSettings
     from improvo.labeling.labeler import run_and_label
     from improvo.odometry.run_settings import RunSettings
+    from improvo.odometry.scale.apply import apply_scale
+    from improvo.odometry.scale.sources import scale_source
     from improvo.sequences import open_sequence
 
     settings = settings or RunSettings()
