@@ -278,3 +278,13 @@ def test_settings_are_checked() -> None:
     ):
         with pytest.raises(ConfigError):
             ScaleSettings(**wrong)  # type: ignore[arg-type]
+
+
+def test_from_python_with_the_settings_of_a_run(room: Path, tmp_path: Path) -> None:
+    import improvo
+    from improvo.depth.run_settings import DenseRunSettings
+    from improvo.frontend.settings import FrontendSettings
+
+    settings = DenseRunSettings(frontend=FrontendSettings("sift", 800), scale=ScaleSettings("truth"))
+    found = improvo.run(room, tmp_path / "out", settings)
+    assert abs(error_of_size(found.trajectory, open_sequence(room).ground_truth)) < 1e-6

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from improvo.labeling.labeler import LabeledRun
     from improvo.labeling.store import SequenceRecord
     from improvo.odometry.run_settings import RunSettings
-    from improvo.odometry.scale.settings import ScaleSettings
     from improvo.sequences import Sequence as ImageSequence
     from improvo.sequences import SequenceSettings
     from improvo.training.settings import OdometryTrainingSettings
@@ -34,7 +33,6 @@ def run(
     output: PathLike,
     settings: RunSettings | None = None,
     frontend: Frontend | None = None,
-    scale: ScaleSettings | None = None,
 ) -> LabeledRun:
     """Visual odometry on one sequence, as `improvo run` does it.
 
@@ -54,6 +52,7 @@ def run(
     from improvo.labeling.labeler import run_and_label
     from improvo.odometry.run_settings import RunSettings
     from improvo.odometry.scale.apply import apply_scale
+    from improvo.odometry.scale.settings import ScaleSettings
     from improvo.odometry.scale.sources import scale_source
     from improvo.sequences import open_sequence
 
@@ -63,7 +62,11 @@ def run(
     depth = settings.depth if isinstance(settings, DenseRunSettings) and settings.dense else None
     if depth is not None:
         refuse_live(sequence)
+    scale = settings.scale if isinstance(settings, DenseRunSettings) else ScaleSettings()
+    ask = scale_source(sequence, scale)  # before any work
     result = run_and_label(sequence, Path(output), settings, frontend=frontend)
+    if ask is not None:
+        result = apply_scale(sequence, result, ask, scale)
     if depth is not None:
         write_dense(sequence, result, depth)
     return result
