@@ -10,7 +10,7 @@ where it was stopped. Three trainings, all of them `improvo train homographies`:
    keep the 32 channels of the small one and leave the paper's other 32 at zero: at full and half resolution they would
    cost three fifths of all time, in training and after. This is `superpoint`.
 
-With --round, the pictures are labelled anew by the network of step 2 before step 3 (homographic adaptation proper).
+With --round, the pictures are labeled anew by the network of step 2 before step 3 (homographic adaptation proper).
 """
 
 from __future__ import annotations

@@ -24,7 +24,8 @@ from improvo.depth.run_settings import DenseRunSettings
 from improvo.simulation import bundled_sequence
 
 ALL = [words for words, _ in leaves()]
-WITH_PAPER = (["run"], ["label"], ["train", "odometry"], ["improve"], ["evaluate", "pose"], ["evaluate", "vo"])
+WITH_PAPER = [["run"], ["label"], ["improve"], ["evaluate", "pose"], ["evaluate", "vo"]]
+WITH_PAPER += [["train", stage] for stage in ("shapes", "homographies", "odometry")]
 
 
 @functools.cache

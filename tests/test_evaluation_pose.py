@@ -13,7 +13,6 @@ import pytest
 from evaluation_scene import CAMERA, PlaneFeatures, PlaneSequence, PlaneSource
 from improvo.cli.main import main
 from improvo.errors import ConfigError, InputError
-from improvo.evaluation.depth import depth_at
 from improvo.evaluation.measures import PairGeometry, PoseError, repeated_keypoints, right_matches
 from improvo.evaluation.pose.estimators import with_opencv, with_poselib
 from improvo.evaluation.pose.pairs import draw_pairs, pairs_of_sequence
@@ -22,6 +21,7 @@ from improvo.evaluation.pose.run import run_pose_protocol
 from improvo.evaluation.pose.tables import pose_tables
 from improvo.evaluation.settings import PoseSettings
 from improvo.evaluation.statistics import Bootstrap, accuracy_curve, area_shares, below
+from improvo.geometry.depth_sampling import depth_at
 from improvo.geometry.se3 import inverse, rigid, so3_exp
 from improvo.jobs.pool import Workers
 

@@ -1,4 +1,4 @@
-"""VO adaptation: what labelled frames tell, the pairs made of them, and that a network learns from it."""
+"""VO adaptation: what labeled frames tell, the pairs made of them, and that a network learns from it."""
 
 from __future__ import annotations
 
@@ -129,10 +129,10 @@ def test_a_thing_that_moves_teaches_and_a_track_that_jumps_once_does_not(tmp_pat
     jumps = write_labeled_scene(tmp_path / "jumps", wrong_link=True)
     everything = LandmarkSettings(unseen=False, unstable_largest_step=1.0)
     for store, taught in ((moves, True), (jumps, False)):
-        labelled = (frames_of(store, everything).points(5).stability == UNSTABLE).sum()
+        labeled = (frames_of(store, everything).points(5).stability == UNSTABLE).sum()
         sure = (frames_of(store, LandmarkSettings(unseen=False)).points(5).stability == UNSTABLE).sum()
-        assert labelled > 20
-        assert sure == (labelled if taught else 0)
+        assert labeled > 20
+        assert sure == (labeled if taught else 0)
 
 
 def test_stability_is_taught_only_where_a_track_saw_the_point(store: Path) -> None:
@@ -264,7 +264,7 @@ def test_the_command_teaches_stability_and_says_so_on_the_card(
     assert "other labels" in capsys.readouterr().err
 
 
-def test_pictures_are_rehearsed_beside_the_labels(store: Path, tiny_weights: Path, tmp_path: Path) -> None:
+def test_pictures_are_replayed_beside_the_labels(store: Path, tiny_weights: Path, tmp_path: Path) -> None:
     import cv2
 
     pictures = tmp_path / "pictures"
@@ -290,8 +290,8 @@ def test_pictures_are_rehearsed_beside_the_labels(store: Path, tiny_weights: Pat
     labels = load_labels(tmp_path / "out" / "labels.npz", [3])
     other = HomographiesSettings(points=48, optimiser=settings.optimiser, views=settings.views)
     pairs = TrackedPairs([frames_of(store, PAPER)], settings, PairBatches(loaded_pictures, labels, other))
-    labelled = [(pairs[step]["stability"] != IGNORED).any(axis=1)[:3] for step in range(10)]
-    assert 0.2 < np.mean(labelled) < 0.8
+    labeled = [(pairs[step]["stability"] != IGNORED).any(axis=1)[:3] for step in range(10)]
+    assert 0.2 < np.mean(labeled) < 0.8
     assert all((pairs[step]["valid"].sum(axis=1) > 0).all() for step in range(3))
 
 
@@ -328,7 +328,7 @@ def test_the_stability_head_can_be_trained_alone(store: Path, tiny_weights: Path
         assert np.array_equal(after.tensors[name], values), name
 
 
-def test_a_detector_can_be_left_to_rehearsal(store: Path) -> None:
+def test_a_detector_can_be_left_to_replay(store: Path) -> None:
     frames = [frames_of(store, LandmarkSettings())]
     taught, left = (
         TrackedPairs(frames, settings_of(pairs=PairSettings(points=48, stability_points=60, teach_detector=teach)))[0]

@@ -48,7 +48,7 @@ PAPER = preset(OdometryTrainingSettings, "paper")
 
 
 class GreyFrames:
-    """Frames of one grey level each, their number; each knows twenty points, which no two frames share if `apart`."""
+    """Frames of one grey level each, their number; each knows 20 points, which no two frames share if `apart`."""
 
     size = (96, 72)
 
@@ -60,6 +60,9 @@ class GreyFrames:
 
     def picture(self, frame: int) -> np.ndarray:
         return np.full((72, 96), frame, np.uint8)
+
+    def mask(self, frame: int) -> None:
+        return None
 
     def useful_frames(self, least: int) -> np.ndarray:
         return np.arange(self.count) if least <= 20 else np.zeros(0, np.int64)

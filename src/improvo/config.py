@@ -9,7 +9,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from improvo.errors import ConfigError
+from improvo.errors import ConfigError, InputError
+from improvo.untrusted.paths import check_path
 from improvo.untrusted.text import load_yaml, reason
 
 T = TypeVar("T")
@@ -68,7 +69,10 @@ def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = (), 
     merged: dict[str, Any] = {}
     if path is not None:
         try:
+            check_path(path)
             loaded = load_yaml(path.read_text(encoding="utf-8")) or {}
+        except InputError as error:
+            raise ConfigError(str(error)) from None
         except (OSError, ValueError) as error:
             raise ConfigError(
                 f"{path}: cannot be read as YAML ({reason(error)}); `improvo config` prints a valid file"

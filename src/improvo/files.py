@@ -99,12 +99,23 @@ def write_json(path: Path, data: Any) -> None:
 
 def write_png(path: Path, rgb: NDArray[np.uint8]) -> None:
     """Write a picture (H, W, 3) RGB."""
-    import cv2
     import numpy as np
 
+    write_picture(path, np.ascontiguousarray(rgb[..., ::-1]))
+
+
+def write_picture(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write a picture (H, W) grey or (H, W, 3) BGR in the format of its suffix; the name may be bytes that are no text.
+
+    (OpenCV 5 ends the process when it is given such a name.)
+    """
+    import cv2
+
     with written_atomically(path) as temporary:
-        if not cv2.imwrite(str(temporary), np.ascontiguousarray(rgb[..., ::-1])):
+        encoded, data = cv2.imencode(path.suffix, image)
+        if not encoded:
             raise OutputError(f"{path}: cannot be written; choose another folder")
+        temporary.write_bytes(data.tobytes())
 
 
 def check_output_folder(path: Path, command: str) -> None:

@@ -51,6 +51,9 @@ def run(
     from improvo.depth.run_settings import DenseRunSettings
     from improvo.labeling.labeler import run_and_label
     from improvo.odometry.run_settings import RunSettings
+    from improvo.odometry.scale.apply import apply_scale
+    from improvo.odometry.scale.settings import ScaleSettings
+    from improvo.odometry.scale.sources import scale_source
     from improvo.sequences import open_sequence
 
     settings = settings or RunSettings()
@@ -59,7 +62,11 @@ def run(
     depth = settings.depth if isinstance(settings, DenseRunSettings) and settings.dense else None
     if depth is not None:
         refuse_live(sequence)
+    scale = settings.scale if isinstance(settings, DenseRunSettings) else ScaleSettings()
+    ask = scale_source(sequence, scale)  # before any work
     result = run_and_label(sequence, Path(output), settings, frontend=frontend)
+    if ask is not None:
+        result = apply_scale(sequence, result, ask, scale)
     if depth is not None:
         write_dense(sequence, result, depth)
     return result

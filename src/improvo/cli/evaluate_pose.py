@@ -17,7 +17,8 @@ from improvo.cli.evaluate_options import add_frontend_arguments, add_run_argumen
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
 from improvo.cli.output import figures, next_step, say
 from improvo.errors import ImprovoError, InputError
-from improvo.evaluation.settings import ESTIMATORS, SAMPLINGS, PoseCommandSettings, PoseSettings
+from improvo.evaluation.settings import ESTIMATORS, PoseCommandSettings, PoseSettings
+from improvo.geometry.depth_sampling import SAMPLINGS
 from improvo.untrusted.text import read_json_file
 
 if TYPE_CHECKING:
@@ -204,10 +205,9 @@ def _draw(results: dict[str, Any], output: Path) -> None:
 
 def _export(arguments: argparse.Namespace) -> int:
     """Write the frames that the evaluation will use, as delivered, for a frontend that runs elsewhere."""
-    import cv2
 
     from improvo.evaluation.pose.pairs import pairs_of_sequence
-    from improvo.files import make_output_folder, written_atomically
+    from improvo.files import make_output_folder, write_picture
 
     make_output_folder(arguments.export_images, f"{COMMAND} --export-images")
     settings, sources = _settings(arguments)
@@ -222,8 +222,7 @@ def _export(arguments: argparse.Namespace) -> int:
                 frame = sequence[row]
             except ImprovoError:
                 continue  # its pairs are left out of the evaluation, too
-            with written_atomically(folder / f"{frame.source_index:06d}.png") as temporary:
-                cv2.imwrite(str(temporary), frame.image)
+            write_picture(folder / f"{frame.source_index:06d}.png", frame.image)
             written += 1
     say(f"{written} images in {arguments.export_images}; export features as SEQUENCE/NUMBER.npz beside or elsewhere")
     return 0

@@ -1,6 +1,7 @@
 """Visual odometry on one sequence.
 
-Leaves trajectory.txt, map.ply, tracks.parquet, points.parquet and run.json in OUT. Poses and map are up to scale.
+Leaves trajectory.txt, map.ply, tracks.parquet, points.parquet and run.json in OUT. Poses and map are up to scale,
+or in metres with --scale.
 """
 
 from __future__ import annotations
@@ -13,9 +14,11 @@ from improvo.cli.flags import add_setting
 from improvo.cli.options import add_config_arguments, add_frontend_arguments, add_sequence_arguments, settings_from
 from improvo.cli.output import figures, next_step, notice, say
 from improvo.depth.run_settings import DenseRunSettings
+from improvo.odometry.scale.settings import USAGE, scale_settings
 
 if TYPE_CHECKING:
     from improvo.labeling.labeler import LabeledRun
+    from improvo.odometry.scale.sources import Ask
     from improvo.odometry.visual_odometry import TrackedFrame
     from improvo.odometry.visualizer import Visualizer
     from improvo.sequences import Sequence
@@ -41,6 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--report", action="store_true", help="write OUT/report.html at the end, as `improvo report` does"
     )
+    parser.add_argument(
+        "--scale",
+        nargs="+",
+        metavar="FROM",
+        help=f"results in metres: {USAGE} (default: up to scale)",
+    )
     add_sequence_arguments(parser)
     add_config_arguments(parser)
 
@@ -49,6 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Track the sequence and write the results; 130 after an interrupt."""
     extra = ["frontend.use_stability=false"] if arguments.no_stability else []
     extra += ["dense=true"] if arguments.dense else []
+    extra += scale_settings(arguments.scale) if arguments.scale else []
     settings = settings_from(DenseRunSettings, arguments, extra=extra)
     from improvo.files import check_output_folder
     from improvo.sequences import open_sequence
@@ -63,11 +73,17 @@ def run(arguments: argparse.Namespace) -> int:
     frames = "live, Ctrl-C ends it: frames" if sequence.length is None else f"{sequence.length} frames"
     say(
         f"{sequence.name}: {sequence.format}, {frames} of {camera.width}x{camera.height}; "
-        f"frontend {settings.frontend.name}; poses and map are up to scale"
+        f"frontend {settings.frontend.name}; poses and map are "
+        + ("up to scale" if settings.scale.source == "none" else f"in metres, by {settings.scale.source}")
     )
     for note in sequence.notes:
         say(f"note: {note}")
+    ask = _scale_source(sequence, settings)
     summary = _track(sequence, arguments.output, settings, _viewer(arguments))
+    if ask is not None:
+        from improvo.odometry.scale.apply import apply_scale
+
+        summary = apply_scale(sequence, summary, ask, settings.scale)
     figures(_figures(summary), "")
     _print_summary(summary)
     interrupted = bool(summary.report["interrupted"])
@@ -94,6 +110,17 @@ def _viewer(arguments: argparse.Namespace) -> Visualizer | None:
     from improvo.report.rerun_viewer import RerunViewer
 
     return RerunViewer(arguments.save)
+
+
+def _scale_source(sequence: Sequence, settings: DenseRunSettings) -> Ask | None:
+    """What will give the metres, looked for before any other work, with its progress."""
+    if settings.scale.source == "none":
+        return None
+    from improvo.odometry.scale.sources import scale_source
+    from improvo.terminal import progress
+
+    with progress("markers", "frame", shown=settings.scale.source == "marker") as shown:
+        return scale_source(sequence, settings.scale, shown.advance)
 
 
 def _track(sequence: Sequence, folder: Path, settings: DenseRunSettings, viewer: Visualizer | None) -> LabeledRun:
@@ -130,8 +157,23 @@ def _add_depth(sequence: Sequence, summary: LabeledRun, settings: DenseRunSettin
 
 def _figures(summary: LabeledRun) -> dict[str, Any]:
     report = summary.report
-    names = ("frames", "segments", "points", "tracks", "events", "interrupted", "seconds", "frames_per_second")
-    return {"folder": str(summary.folder), **{name: report[name] for name in names}}
+    names = ("frames", "segments", "points", "tracks", "events", "interrupted", "seconds", "frames_per_second", "scale")
+    return {"folder": str(summary.folder), **{name: report[name] for name in names}, "metric": report.get("metric")}
+
+
+def _scale_lines(report: dict[str, Any]) -> list[str]:
+    """The scale of each segment, and how it changes."""
+    if not report.get("metric"):
+        return []
+    lines = [f"unit: {report['scale']}"]
+    for entry in report["metric"]["segments"]:
+        error, change = entry["relative_error"], entry["change"]
+        text = f"segment {entry['segment']}: {entry['metres_per_unit']:.5g} m a unit"
+        text += "" if error is None else f", ±{100 * error:.2g} %"
+        text += f", by {entry['measurements']} measurement(s)"
+        text += "" if change is None else f"; {100 * change:+.1f} % from its first to its last third"
+        lines.append(text)
+    return lines
 
 
 def _print_summary(summary: LabeledRun) -> None:
@@ -144,7 +186,10 @@ def _print_summary(summary: LabeledRun) -> None:
         f"{report['points']} points; {report['frames_per_second']} frames/s"
     )
     for segment in segments[1:] if len(segments) > 1 else []:
-        say(f"  segment {segment['number']} starts at frame {segment['first']}: own scale, placed by guess")
+        own = "" if report.get("metric") else "own scale, "
+        say(f"  segment {segment['number']} starts at frame {segment['first']}: {own}placed by guess")
+    for line in _scale_lines(report):
+        say(f"  {line}")
     warnings = [event for event in report["events"] if event["kind"] in ("lost", "contradiction")]
     for event in warnings[:_WARNINGS]:
         say(f"  frame {event['frame_index']}: {event['kind']}: {event['detail']}")

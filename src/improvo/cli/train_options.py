@@ -108,7 +108,9 @@ def print_metrics(output: Path, metrics: dict[str, Any], then: str) -> None:
     """
     weights = output / "weights.safetensors"
     losses = ", ".join(f"{name} {metrics[name]:.3f}" for name in ("loss", "detector", "descriptor") if name in metrics)
-    waited = f"{100 * metrics['loading_share']:.0f} % of the time waiting for data"
+    waited = (
+        f"; {100 * metrics['loading_share']:.0f} % of the time waiting for data" if "loading_share" in metrics else ""
+    )
     figures({"weights": str(weights), **metrics}, "")
-    say(f"{weights}: step {metrics['step']}, {losses}; {waited}")
+    say(f"{weights}: step {metrics['step']}{', ' if losses else ''}{losses}{waited}")
     next_step(then)

@@ -73,15 +73,15 @@ def _merged(keys: Int64, sums: Float64) -> tuple[Int64, Float64]:
     return keys[starts], np.add.reduceat(sums[order], starts) if len(starts) else sums[:0]
 
 
-def write_cloud(path: Path, points: Float64, colours: UInt8) -> None:
-    """A binary PLY of points (P, 3) and colours (P, 3), red first, which every 3D viewer opens."""
+def write_cloud(path: Path, points: Float64, colours: UInt8, unit: str = "up to scale") -> None:
+    """A binary PLY of points (P, 3) in a unit and colours (P, 3), red first, which every 3D viewer opens."""
     kinds = [(axis, "<f4") for axis in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
     rows = np.zeros(len(points), np.dtype(kinds))
     for column, (name, _) in enumerate(kinds):
         rows[name] = points[:, column] if column < 3 else colours[:, column - 3]
     words = {"<f4": "float", "u1": "uchar"}
-    header = ["ply", "format binary_little_endian 1.0", "comment improvo dense points, up to scale"]
+    header = ["ply", "format binary_little_endian 1.0", f"comment improvo dense points, {unit}"]
     header += [f"element vertex {len(rows)}", *(f"property {words[kind]} {name}" for name, kind in kinds)]
     with written_atomically(path) as temporary, temporary.open("wb") as file:
-        file.write(("\n".join([*header, "end_header"]) + "\n").encode())
+        file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii", "replace"))
         file.write(rows.tobytes())

@@ -84,7 +84,7 @@ def write_dense(
         except KeyboardInterrupt:
             interrupted = True
     points, colours = cloud.points()
-    write_cloud(folder / CLOUD_FILE, points, colours)
+    write_cloud(folder / CLOUD_FILE, points, colours, summary.unit)
     entry = {
         "frames": frames,
         "pixels": pixels,

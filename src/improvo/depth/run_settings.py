@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from improvo.depth.settings import DepthSettings
 from improvo.odometry.run_settings import RunSettings
+from improvo.odometry.scale.settings import ScaleSettings
 
 
 @dataclass(frozen=True)
@@ -14,3 +15,4 @@ class DenseRunSettings(RunSettings):
 
     dense: bool = False  # leave depth.zip and dense.ply as well
     depth: DepthSettings = field(default_factory=DepthSettings)
+    scale: ScaleSettings = field(default_factory=ScaleSettings)

@@ -37,9 +37,9 @@ class SweepSettings:
     """The plane sweep of one frame."""
 
     planes: int = 80  # evenly spaced in inverse depth
-    min_score: float = 0.6  # mean ZNCC over the better half of the neighbours
-    min_texture: float = 2.0  # grey levels, standard deviation within the window
-    max_second: float = 0.8  # (1 - best) / (1 - second): of the best score and of the best one at another depth
+    min_score: float = 0.4  # mean ZNCC over the better half of the neighbours; the refinement asks for more
+    min_texture: float = 1.0  # grey levels, standard deviation within the window
+    max_second: float = 0.9  # (1 - best) / (1 - second): of the best score and of the best one at another depth
 
     def __post_init__(self) -> None:
         if not 8 <= self.planes <= 1000:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from improvo.evaluation.depth import depth_at
 from improvo.geometry.camera import Camera
+from improvo.geometry.depth_sampling import depth_at
 from improvo.geometry.se3 import inverse, rotation_angle_deg, transform
 from improvo.types import Float32, Float64, Int64
 

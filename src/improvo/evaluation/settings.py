@@ -6,11 +6,12 @@ import math
 from dataclasses import dataclass, field
 
 from improvo.errors import ConfigError
+from improvo.geometry.depth_sampling import SAMPLINGS
 from improvo.odometry.settings import OdometrySettings
 from improvo.sequences.base import SequenceSettings
 
 ESTIMATORS = ("opencv", "poselib")
-SAMPLINGS = ("bilinear", "nearest")
+
 ALIGNMENTS = ("sim3", "se3", "none")
 
 

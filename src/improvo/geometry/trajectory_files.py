@@ -24,7 +24,7 @@ from improvo.types import Float64, Int64, Trajectory
 RIGID_TOLERANCE = 1e-2
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")
-_TUM_HEADER = "# camera-to-world, up to scale: timestamp tx ty tz qx qy qz qw\n"
+_TUM_HEADER = "# camera-to-world, {}: timestamp tx ty tz qx qy qz qw\n"
 _SEGMENT_COMMENT = re.compile(r"#\s*segment\s+(\d+)\s*(?::|$)")
 
 
@@ -86,11 +86,17 @@ def read_trajectory_report(
     return trajectory, tuple(f"{path}: {problem}" for problem in problems)
 
 
-def write_trajectory(path: Path | str, trajectory: Trajectory, format: str = "tum") -> None:
+def write_trajectory(path: Path | str, trajectory: Trajectory, format: str = "tum", unit: str = "up to scale") -> None:
     """Write a trajectory atomically; rows without a pose are left out of TUM files.
 
     A comment line `# segment N: ...` goes before each new segment; `read_trajectory` understands it, others skip it.
     KITTI files have neither times nor gaps: every row must have a pose.
+
+    Args:
+        path: the file.
+        trajectory: what to write.
+        format: tum or kitti.
+        unit: of lengths, for the first line of a TUM file.
 
     Raises:
         InputError: an unknown format, or a gap in a KITTI file.
@@ -103,18 +109,19 @@ def write_trajectory(path: Path | str, trajectory: Trajectory, format: str = "tu
         rows = (" ".join(f"{value:.12g}" for value in pose[:3].ravel()) for pose in trajectory.world_from_cam)
         write_text(path, "".join(f"{row}\n" for row in rows))
     elif format == "tum":
-        write_text(path, tum_text(trajectory))
+        write_text(path, tum_text(trajectory, unit))
     else:
         raise InputError(f"{path}: unknown trajectory format {format!r}; known: tum, kitti")
 
 
-def tum_text(trajectory: Trajectory) -> str:
+def tum_text(trajectory: Trajectory, unit: str = "up to scale") -> str:
     """The trajectory as the text of a TUM file."""
-    lines, segment = [_TUM_HEADER], None
+    lines, segment = [_TUM_HEADER.format(unit.replace(":", ","))], None
+    own = "world frame" if unit.startswith("metres") else "world frame and scale"
     for row in np.flatnonzero(trajectory.valid):
         if trajectory.segment[row] != segment:
             segment = trajectory.segment[row]
-            lines.append(f"# segment {segment}: has its own world frame and scale\n")
+            lines.append(f"# segment {segment}: has its own {own}\n")
         lines.append(tum_row(float(trajectory.times[row]), trajectory.world_from_cam[row]))
     return "".join(lines)
 
@@ -283,6 +290,8 @@ def read_times(path: Path) -> tuple[Float64, tuple[str, ...]]:
     lines = read_text(path, "times", mend).splitlines()
     lines = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     rows = [split_numbers(line) for line in lines]
+    if not all(rows):
+        raise InputError(f"{path}: has a line of separators alone; {mend}")
     if all(re.fullmatch(r"\d+,\d+", line) for line in lines) and not _counts(rows):
         whole = [float(row[0]) for row in rows]
         if any(b <= a for a, b in pairwise(whole)):  # decimal commas: alone, the part before them does not increase
@@ -295,7 +304,7 @@ def read_times(path: Path) -> tuple[Float64, tuple[str, ...]]:
         else:
             column = 1 if _counts(rows) else 0
             stamps = np.array([float(row[column]) for row in rows], np.float64)
-    except ValueError as error:
+    except (ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{path}: must hold one time in seconds per line ({error}); repair or remove it") from None
     if not np.isfinite(stamps).all():
         raise InputError(f"{path}: holds a time that is not finite; repair or remove it")
@@ -305,7 +314,7 @@ def read_times(path: Path) -> tuple[Float64, tuple[str, ...]]:
 
 def _counts(rows: list[list[str]]) -> bool:
     """Whether the first column only numbers the rows, and the second has the times."""
-    if len(rows) < 2 or not all(len(row) > 1 and row[0].isdigit() and _is_number(row[1]) for row in rows):
+    if len(rows) < 2 or not all(len(row) > 1 and row[0].isdecimal() and _is_number(row[1]) for row in rows):
         return False
     numbers, second = (np.array([float(row[column]) for row in rows]) for column in (0, 1))
     return bool((np.diff(numbers) == 1).all() and (np.diff(second) > 0).all())

@@ -24,8 +24,8 @@ _FIELDS = (
 _PLY_TYPES = {"float": "<f4", "double": "<f8", "int": "<i4", "uint": "<u4", "uchar": "u1", "short": "<i2"}
 
 
-def write_map(path: Path, sparse_map: SparseMap) -> None:
-    """Binary PLY, one vertex per map point, up to scale."""
+def write_map(path: Path, sparse_map: SparseMap, unit: str = "up to scale") -> None:
+    """Binary PLY, one vertex per map point; `unit` of lengths goes into a comment."""
     rows = np.zeros(len(sparse_map), np.dtype([(name, kind) for name, kind, _ in _FIELDS]))
     rows["x"], rows["y"], rows["z"] = sparse_map.xyz.T
     rows["observations"], rows["mean_error"] = sparse_map.observations, sparse_map.mean_error
@@ -33,7 +33,7 @@ def write_map(path: Path, sparse_map: SparseMap) -> None:
     header = [
         "ply",
         "format binary_little_endian 1.0",
-        "comment improvo map, up to scale",
+        f"comment improvo map, {unit.encode('ascii', 'replace').decode()}",
         f"element vertex {len(rows)}",
     ]
     header += [f"property {kind} {name}" for name, _, kind in _FIELDS]

@@ -44,9 +44,19 @@ class RunSummary:
     report: dict[str, Any]
 
     @property
+    def unit(self) -> str:
+        """Of lengths, for a person."""
+        return unit_of(self.report)
+
+    @property
     def tracked(self) -> int:
         """Frames with a pose."""
         return int(self.trajectory.valid.sum())
+
+
+def unit_of(report: dict[str, Any]) -> str:
+    """The unit of a run's lengths, in words, by its run.json: metres and from what they are known, or up to scale."""
+    return str(report["scale"]) if report.get("metric") else "up to scale"
 
 
 def run_odometry(

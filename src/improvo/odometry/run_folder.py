@@ -16,10 +16,12 @@ from improvo.errors import InputError
 from improvo.geometry.camera import Camera
 from improvo.geometry.trajectory_files import read_trajectory
 from improvo.odometry.map_file import read_map
+from improvo.odometry.run import unit_of
 from improvo.sequences import Sequence, SequenceSettings, open_sequence
 from improvo.stability.rule import IGNORE
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
 from improvo.types import Float64, Int64, SparseMap, Trajectory, UInt8
+from improvo.untrusted.paths import check_path
 from improvo.untrusted.text import read_json_file, reason
 
 _FORMER_KINDS = {"waiting": "initialising"}  # of events
@@ -60,8 +62,9 @@ class RunFolder:
         if not path.is_dir():
             raise InputError(f"{path}: no such folder; give the output folder of `improvo run`")
         try:
-            self.report = _with_present_names(read_json_file(path / "run.json", "run `improvo run` again"))
-            self._recorded_input = Path(self.report["input"]["path"])
+            report = _with_present_names(read_json_file(path / "run.json", "run `improvo run` again"))
+            self.report: dict[str, Any] = _told_where(report, f"{path / 'run.json'}")
+            self._recorded_input = check_path(Path(self.report["input"]["path"]))
             self.source_index: list[int] = self.report["frames"]["source_index"]
             _check(self.report)
         except FileNotFoundError:
@@ -73,6 +76,11 @@ class RunFolder:
     def name(self) -> str:
         """The recording's name."""
         return self._recorded_input.name or str(self._recorded_input)
+
+    @property
+    def unit(self) -> str:
+        """Of lengths, in words: metres and from what they are known, or up to scale."""
+        return unit_of(self.report)
 
     @property
     def frames(self) -> int:
@@ -227,6 +235,26 @@ def why_no_pose(report: dict[str, Any]) -> str | None:
     return f"no frame has a pose: {reason}; {mend}"
 
 
+class _Section(dict[str, Any]):
+    """A part of run.json; what it lacks is an error of the file, wherever it is asked for."""
+
+    where = ""
+
+    def __missing__(self, key: object) -> Any:
+        raise InputError(f"{self.where}: has no `{key}`; run `improvo run` again")
+
+
+def _told_where(value: Any, where: str) -> Any:
+    """The same with every dictionary a section that knows its file."""
+    if isinstance(value, list):
+        return [_told_where(item, where) if isinstance(item, dict | list) else item for item in value]
+    if not isinstance(value, dict):
+        return value
+    section = _Section({key: _told_where(item, where) for key, item in value.items()})
+    section.where = where
+    return section
+
+
 def _check(report: dict[str, Any]) -> None:
     """Refuse a run.json that is not as `improvo run` writes it.
 
@@ -234,13 +262,13 @@ def _check(report: dict[str, Any]) -> None:
         ValueError, KeyError, TypeError: it is not.
     """
     frames, indices = report["frames"], report["frames"]["source_index"]
-    lists = [indices, frames.get("lost_frames", []), [frames.get("tracked", 0)]]
+    lists = [indices, frames["lost_frames"], [frames["tracked"]]]
     if not all(isinstance(row, list) and all(type(number) is int for number in row) for row in lists):
         raise ValueError("its frames are no numbers")
     if any(b <= a for a, b in pairwise(indices)) or not all(0 <= number < 1 << 40 for number in indices):
         raise ValueError("its frames are out of order")
-    if not all(isinstance(report[name], dict) for name in ("camera", "configuration")):
-        raise ValueError("it has no camera or no configuration")
+    if not all(isinstance(report.get(name, {}), dict) for name in ("camera", "configuration")):
+        raise ValueError("its camera or configuration has no names")
     for event in report["events"]:
         if not isinstance(event["kind"], str):
             raise ValueError("an event is of no kind")

@@ -14,7 +14,7 @@ from improvo.report.page import Page, plain
 
 @dataclass(frozen=True)
 class Measure:
-    """A number that every round is judged by."""
+    """A measure that is compared over all rounds."""
 
     name: str  # with its unit, and the solver where one matters: "rotation < 5 degrees, gap 30, poselib"
     meaning: str
@@ -24,7 +24,7 @@ class Measure:
 
 @dataclass(frozen=True)
 class Round:
-    """One frontend and what is known of it; the first is the one before any improvement."""
+    """One frontend and its results; the first is the one before any improvement."""
 
     name: str
     values: dict[str, float] = field(default_factory=dict)  # by name of the measure

@@ -92,7 +92,8 @@ def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: in
     axis.set_aspect("equal")
     axis.grid(color="white", alpha=0.12, linewidth=0.6)
     axis.tick_params(labelsize=8)
-    axis.set_xlabel("right of the first camera (map units: the first median depth is 1)", fontsize=8)
+    unit = "metres" if run.unit.startswith("metres") else "map units: the first median depth is 1"
+    axis.set_xlabel(f"right of the first camera ({unit})", fontsize=8)
     axis.set_ylabel("ahead of the first camera", fontsize=8)
     axis.set_title(_title(run, len(shown), int((~inside).sum())), fontsize=10)
     _time_bar(figure, axis, palette, run.frames, len(last))
@@ -102,18 +103,22 @@ def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: in
 
 
 def trusted_points(sparse_map: SparseMap) -> NDArray[np.intp]:
-    """Rows of the points that are worth drawing: seen at least three times, and with an ordinary error."""
+    """Rows of the good points: at least three observations, and a mean error below 2 pixels."""
     good = (sparse_map.observations >= 3) & (sparse_map.mean_error < 2.0) & np.isfinite(sparse_map.xyz).all(axis=1)
     return np.flatnonzero(good)
 
 
 def _title(run: RunFolder, points: int, outside: int) -> str:
     frames, segments = run.report["frames"], run.report["segments"]
-    parts = [f"{frames['tracked']} of {frames['processed']} frames have a pose", f"{points} points"]
+    parts = [
+        f"{frames['tracked']} of {frames['processed']} frames have a pose",
+        f"{points} good points of {len(run.map)}",
+    ]
     if outside:
         parts.append(f"{outside} far ones outside the picture")
     if len(segments) > 1:
-        parts.append(f"{len(segments)} segments, each with its own scale, placed by guess")
+        own = "" if run.unit.startswith("metres") else "each with its own scale, "
+        parts.append(f"{len(segments)} segments, {own}placed by guess")
     return f"{run.name}, {Path(run.report['frontend']).name}, seen from above\n" + "; ".join(parts)
 
 
@@ -129,7 +134,7 @@ def _point_style(count: int) -> tuple[float, float]:
 
 
 def _time_bar(figure: object, axis: object, palette: Palette, frames: int, last: int) -> None:
-    """What the colours mean."""
+    """The colour bar."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 

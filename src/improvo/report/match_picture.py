@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from improvo.evaluation.depth import depth_at
 from improvo.evaluation.pose.estimators import with_poselib
 from improvo.frontend import Frontend
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
+from improvo.geometry.depth_sampling import depth_at
 from improvo.report.canvas import Canvas, captioned, stacked
 from improvo.report.palettes import PALETTES, Palette
 from improvo.tracking.matching import mutual_nearest_neighbours

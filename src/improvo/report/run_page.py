@@ -64,7 +64,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
     page = Page(
         f"Visual odometry of {run.name}",
         f"{frames['processed']} frames of {run.camera.width}x{run.camera.height}, {report['input']['format']}; "
-        f"frontend {report['frontend']}; poses and map are up to scale.",
+        f"frontend {report['frontend']}; poses and map are {run.unit}.",
     )
     tracks = run.points.counts()
     page.tiles(
@@ -72,6 +72,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
             (f"{frames['tracked']} of {frames['processed']}", "frames with a pose"),
             (str(len(report["segments"])), "segments (1 is best)"),
             (f"{report['points']:,}", "map points"),
+            *([(f"{_path_length(run):.4g} m", "path of the camera")] if report.get("metric") else []),
             (f"{median_error:.2f} px" if np.isfinite(median_error) else "-", "median re-projection error"),
             (f"{report['frames_per_second']:g}", "frames per second"),
             (f"{tracks['stable']:,} / {tracks['unstable']:,}", "stable / unstable tracks"),
@@ -86,6 +87,12 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
     _labels_section(page, run)
     _timing_section(page, run)
     page.write(path)
+
+
+def _path_length(run: RunFolder) -> float:
+    """Summed over the segments."""
+    steps = np.linalg.norm(np.diff(run.trajectory.camera_centers, axis=0), axis=1)
+    return float(steps[np.diff(run.trajectory.segment) == 0].sum())
 
 
 def _map_section(page: Page, run: RunFolder, palette: Palette) -> None:

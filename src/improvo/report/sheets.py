@@ -11,6 +11,7 @@ from improvo.errors import OutputError
 from improvo.files import write_png, written_atomically
 from improvo.report.canvas import stacked
 from improvo.types import UInt8
+from improvo.untrusted.paths import is_text
 
 # Codecs that OpenCV's wheels can write into MP4: VP9 plays in browsers, MPEG-4 is the fallback.
 _CODECS = ("vp09", "mp4v")
@@ -46,6 +47,8 @@ def write_video(path: Path, pictures: Iterable[UInt8], fps: float) -> None:
 def _writer(path: Path, fps: float, width: int, height: int) -> cv2.VideoWriter | None:  # type: ignore[name-defined] # noqa: F821
     import cv2
 
+    if not is_text(path):  # OpenCV ends the process
+        return None
     # OpenCV's own warning that a codec is not usual in MP4 would only worry people
     log = getattr(cv2.utils, "logging", None)
     level = log.getLogLevel() if log else None

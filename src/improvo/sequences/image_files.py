@@ -1,4 +1,4 @@
-"""The image files of one recording, read all in the same way: grey levels, and the rotation that cameras note."""
+"""The image files of one recording, all read in the same way: the same grey levels and the same EXIF rotation."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.grey_levels import SAMPLES, Stretch, stretch_of, to_8_bits
 from improvo.sequences.images import decode, file_bytes
 from improvo.types import UInt8
+from improvo.untrusted.paths import is_text
 
 _HEAD = 1 << 16  # bytes in which a JPEG's orientation stands
 _FLAGS = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
@@ -23,8 +24,8 @@ _PLAIN = 1  # the orientation of a picture that is stored as it is seen
 class ImageFiles:
     """Files by their number. `notes` say what was done to their grey levels and orientation.
 
-    A rotation that all pictures note (a phone held upright) is applied. Where it changes within a recording, none is:
-    the camera's own calibration holds for the pictures as the sensor made them.
+    An EXIF rotation that all pictures share (a phone held upright) is applied. If it changes within a recording, none
+    is applied, because the calibration holds for the unrotated pictures.
     """
 
     def __init__(self, files: Iterable[Path], where: Path) -> None:
@@ -66,7 +67,7 @@ class ImageFiles:
         """How many pictures the first file holds, if it is a TIFF."""
         if not self.files or self.files[0].suffix.lower() not in (".tif", ".tiff") or not self.files[0].is_file():
             return 1
-        return int(cv2.imcount(str(self.files[0])))
+        return int(cv2.imcount(str(self.files[0]))) if is_text(self.files[0]) else 1
 
     def _common_stretch(self) -> Stretch | None:
         first = next((row for row, file in enumerate(self.files[:SAMPLES]) if _may_be_deep(file)), None)

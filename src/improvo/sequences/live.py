@@ -1,7 +1,7 @@
 """Webcams (`0`, `1`, ...) and network streams (`rtsp://`, `http://`, ...), live: always the latest frame.
 
-A thread keeps the newest frame; what the reader was too slow for is dropped and counted. A live recording has no
-length, no random access and no ground truth.
+A thread keeps the newest frame; frames that the reader was too slow for are dropped and counted. A live recording has
+no length, no random access and no ground truth.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
 from improvo.types import UInt8
+from improvo.untrusted.paths import is_text
 
 OPEN_TIMEOUT = 10.0  # seconds until a stream counts as unreachable
 FRAME_TIMEOUT = 5.0  # seconds without a frame until the source counts as gone
@@ -99,6 +100,8 @@ def _address(path: str) -> str | None:
 
 
 def _open(name: str) -> cv2.VideoCapture:
+    if not is_text(Path(name)):
+        raise InputError(f"{name!r}: is no address")
     if name.isdigit():
         capture = cv2.VideoCapture(int(name))
         mend = "is it plugged in, and not used by another program?"

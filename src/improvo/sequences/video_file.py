@@ -20,6 +20,7 @@ from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameE
 from improvo.sequences.rates import DEFAULT_FPS
 from improvo.sequences.video_codec import is_script, why_unreadable
 from improvo.types import Int64, UInt8
+from improvo.untrusted.paths import is_text
 
 VIDEO_SUFFIXES = frozenset(
     {
@@ -57,6 +58,8 @@ class VideoFile(Recording):
         self._capture: cv2.VideoCapture | None = None
         if not path.is_file():
             raise InputError(f"{path}: is no video file")
+        if not is_text(path.absolute()):
+            raise InputError(f"{path}: the name is no text, which the video decoder cannot open; rename it")
         if path.stat().st_size == 0:
             raise InputError(f"{path}: the file is empty; copy the video again")
         if is_script(path):
@@ -113,7 +116,7 @@ class VideoFile(Recording):
         self._close()
 
     def _grab(self) -> bool:
-        """Decode one frame further; `_position` is then the frame that its time stamp says."""
+        """Decode the next frame; `_position` is then its number, found by its time stamp."""
         capture = self._opened()
         self._image = None
         if not capture.grab():
@@ -145,8 +148,8 @@ class VideoFile(Recording):
 def _index(path: Path) -> tuple[Int64, Int64]:
     """Time stamps of all frames in microseconds, increasing, and which of them are key frames that can be sought.
 
-    Where the packets' stamps are not those of the decoded frames (AVI with B-frames, MPEG-1), everything is decoded
-    once, frames are then known by counting, and there are no key frames.
+    If the packets' stamps are not those of the decoded frames (AVI with B-frames, MPEG-1), the whole file is decoded
+    once. Frames are then identified by counting, and there are no key frames.
     """
     packets = cv2.VideoCapture(_name(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
     stamps, is_key = [], []

@@ -39,7 +39,14 @@ def shi_tomasi(keypoints: int = 120, distance: int = 4) -> Detector:
 def network_detector(
     network: SuperPoint, device: torch.device, settings: AdaptationSettings, threshold: float = 0.015
 ) -> Detector:
-    """A trained detector; the views of a picture are made on the device and go through the network as one batch."""
+    """A trained detector. The views of a picture are made on the device and go through the network as one batch.
+
+    Args:
+        network: to adapt.
+        device: that it runs on.
+        settings: number of keypoints, and their distance.
+        threshold: least probability of a keypoint.
+    """
     network = network.eval().to(device, memory_format=torch.channels_last)
     suppressed = np.ones((2 * settings.suppression + 1,) * 2, np.uint8)
 
@@ -59,7 +66,16 @@ def network_detector(
 
 
 def warp_batch(picture: Tensor, homographies: Float64, size: tuple[int, int]) -> Tensor:
-    """Views (V, 1, height, width) of a picture (H, W) through homographies (V, 3, 3), bilinear, mirrored outside."""
+    """Views of a picture, bilinear, mirrored outside.
+
+    Args:
+        picture: (H, W) float.
+        homographies: (V, 3, 3) picture to view.
+        size: width and height of a view, pixels.
+
+    Returns:
+        (V, 1, height, width) on the device of the picture.
+    """
     width, height = size
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     pixels = torch.stack([x, y, torch.ones_like(x)], dim=-1).reshape(-1, 3).to(picture)
@@ -75,7 +91,16 @@ def warp_batch(picture: Tensor, homographies: Float64, size: tuple[int, int]) ->
 def adapt(
     pictures: Pictures, detect: Detector, settings: AdaptationSettings, views: ViewSettings, seed: int, progress: bool
 ) -> list[list[PointLabels]]:
-    """Labels of every picture of every source, by the agreement of `detect` over random views."""
+    """Labels of every picture of every source, by the agreement of a detector over random views.
+
+    Args:
+        pictures: to label.
+        detect: the detector.
+        settings: how many views, and how many of them must agree.
+        views: what a view may be.
+        seed: of the views.
+        progress: show it.
+    """
     result = []
     with terminal.progress("homographic adaptation", "picture", len(pictures), progress) as shown:
         for s, source in enumerate(pictures.sources):

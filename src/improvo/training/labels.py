@@ -40,8 +40,12 @@ def label_cells(
     """What the detector head is taught about a view: (Hc, Wc) the pixel of the keypoint 0..63, DUSTBIN or IGNORED.
 
     Args:
-        points: (N, 2) labelled points in pixels of the view, best first; NaN where not visible.
+        points: (N, 2) labeled points in pixels of the view, best first; NaN where not visible.
+        agreement: (N,) see `PointLabels`.
         visible: (height, width) bool, where the view shows the picture and not its mirrored outside.
+        width: of the view, pixels, a multiple of 8.
+        height: of the view, pixels, a multiple of 8.
+        settings: from which agreement on a point is a label, or ignored.
     """
     cells = np.full((height // 8, width // 8), DUSTBIN, np.int64)
     cells[~visible.reshape(height // 8, 8, width // 8, 8).all(axis=(1, 3))] = IGNORED
@@ -67,7 +71,14 @@ class Consensus:
         self.seen = np.zeros((height, width), np.float32)
 
     def add(self, keypoints: Float32, view_from_picture: Float64, view_size: tuple[int, int], border: int) -> None:
-        """Detections (N, 2) in pixels of one view of `view_size` (width, height)."""
+        """Count the detections in one view.
+
+        Args:
+            keypoints: (N, 2) pixels of the view.
+            view_from_picture: (3, 3) homography.
+            view_size: width, height.
+            border: pixels along the edge of the view that are not counted.
+        """
         picture_from_view = np.linalg.inv(view_from_picture)
         mask = np.zeros(view_size[::-1], np.float32)
         mask[border : view_size[1] - border, border : view_size[0] - border] = 1

@@ -10,7 +10,13 @@ from improvo.types import UInt8
 
 
 def augment(image: UInt8, rng: np.random.Generator, settings: PhotometricSettings) -> UInt8:
-    """A copy of a grey image (H, W) under another light and another sensor, in the order light travels."""
+    """A copy under another light and another sensor, in the order light travels.
+
+    Args:
+        image: (H, W) grey.
+        rng: of all choices.
+        settings: what may change, and how much.
+    """
     result = image.astype(np.float32)
     if rng.uniform() < settings.shade_share:
         result *= _shade(result.shape, rng, settings.shade)

@@ -21,6 +21,8 @@ class _StageSettings(Protocol):
 class SeededBatches:
     """As many batches as the optimiser makes steps. Subclasses say what the elements of a batch are.
 
+    A training that was killed makes the same batches again, whatever the number of workers.
+
     Args:
         settings: of the stage.
     """

@@ -40,14 +40,26 @@ class Checks:
             self.that(name, low <= value <= high, f"must lie between {low:g} and {high:g}")
 
     def interval(self, name: str, above: float, most: float = math.inf) -> None:
-        """A pair (low, high) with above < low <= high <= most."""
+        """A pair (low, high) of finite numbers, low no larger than high.
+
+        Args:
+            name: of the setting.
+            above: both are larger than this.
+            most: and no larger than this.
+        """
         low, high = getattr(self._settings, name)
         upper = f", both at most {most:g}" if math.isfinite(most) else ""
         good = above < low <= high <= most and math.isfinite(high)
         self.that(name, good, f"must be two numbers above {above:g}, the second no smaller than the first{upper}")
 
     def choice(self, name: str, choices: Iterable[str], pattern: str = "") -> None:
-        """One of some words, or a word that a regular expression matches as a whole."""
+        """One of some words.
+
+        Args:
+            name: of the setting.
+            choices: the words, at least two.
+            pattern: regular expression of words that are allowed too.
+        """
         value = getattr(self._settings, name)
         known = list(choices)
         good = value in known or bool(pattern and re.fullmatch(pattern, value))
@@ -55,6 +67,11 @@ class Checks:
 
     def that(self, name: str, holds: bool, must: str) -> None:
         """Anything else.
+
+        Args:
+            name: of the setting.
+            holds: whether its value is good.
+            must: what it must be, in words.
 
         Raises:
             ConfigError: it does not hold.

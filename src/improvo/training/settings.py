@@ -223,7 +223,7 @@ class PairSettings:
     least_points: int = 16  # points that two frames must share, else nearer ones are taken; 0 (the paper) asks for none
     points: int = 256  # correspondences taught per pair
     stability_points: int = 200  # labeled points taught per view, at most; up to half of them unstable ones
-    # a cell in which no keypoint was ever followed to a neighbouring frame is taught to have none; False ignores it
+    # a cell in which no keypoint was ever followed to a neighbouring frame has none (the dustbin); False ignores it
     untracked_is_background: bool = True
     # False: labeled frames teach descriptors and stability; the detector learns from replay alone
     teach_detector: bool = True

@@ -19,7 +19,13 @@ LEAST_CONTRAST = 40.0  # grey levels between a shape and what is behind it
 
 
 class Canvas:
-    """A picture being drawn; coordinates are pixels of the finished picture, with sub-pixel precision."""
+    """A picture being drawn; coordinates are pixels of the finished picture, with sub-pixel precision.
+
+    Args:
+        rng: of the background and its grey level.
+        width: pixels.
+        height: pixels.
+    """
 
     def __init__(self, rng: np.random.Generator, width: int, height: int) -> None:
         self.rng, self.size = rng, np.array([width, height], np.float64)
@@ -36,14 +42,31 @@ class Canvas:
         return 0.0 if self.grey > 127 else 255.0
 
     def polygon(self, corners: Float64, grey: float) -> None:
+        """Fill a polygon with corners (N, 2)."""
         cv2.fillPoly(self.image, [_fixed(corners)], grey, cv2.LINE_8, 4)
 
     def line(self, start: Float64, end: Float64, grey: float, thickness: float) -> None:
+        """Draw a line.
+
+        Args:
+            start: (2,) pixels.
+            end: (2,) pixels.
+            grey: level, 0 to 255.
+            thickness: pixels.
+        """
         along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
         across = 0.5 * thickness * np.array([-along[1], along[0]])
         self.polygon(np.stack([start + across, end + across, end - across, start - across]), grey)
 
     def ellipse(self, centre: Float64, axes: Float64, angle: float, grey: float) -> None:
+        """Fill an ellipse.
+
+        Args:
+            centre: (2,) pixels.
+            axes: (2,) half axes, pixels.
+            angle: of the first axis, radians.
+            grey: level, 0 to 255.
+        """
         turns = np.linspace(0, 2 * np.pi, 64, endpoint=False)
         circle = np.stack([axes[0] * np.cos(turns), axes[1] * np.sin(turns)], axis=1)
         c, s = np.cos(angle), np.sin(angle)
@@ -65,6 +88,12 @@ class Canvas:
 
 def draw_shape(rng: np.random.Generator, family: str, width: int, height: int) -> tuple[UInt8, Float32]:
     """One picture of a family.
+
+    Args:
+        rng: of all choices.
+        family: a key of `FAMILIES`.
+        width: pixels.
+        height: pixels.
 
     Returns:
         grey image (height, width) uint8, and its corners (N, 2) float32, x, y in pixels.

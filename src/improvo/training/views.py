@@ -20,7 +20,17 @@ def warp_points(H: NDArray[Any], points: NDArray[Any]) -> Float64:
 
 
 def inside(points: NDArray[Any], width: int, height: int, margin: float = 0.0) -> NDArray[np.bool_]:
-    """(...,) whether points (..., 2) lie at least `margin` pixels within the image; NaN does not."""
+    """Whether points lie within the image; NaN does not.
+
+    Args:
+        points: (..., 2) pixels.
+        width: of the image, pixels.
+        height: of the image, pixels.
+        margin: pixels along its edge that are outside.
+
+    Returns:
+        (...,) bool.
+    """
     x, y = points[..., 0], points[..., 1]
     within = (x >= margin) & (y >= margin) & (x <= width - 1 - margin) & (y <= height - 1 - margin)
     return np.asarray(within, np.bool_)
@@ -35,6 +45,8 @@ def random_view(
     """A homography (3, 3) from picture pixels to view pixels.
 
     Args:
+        rng: of all choices.
+        settings: what a view may be.
         picture_size: width, height of the picture.
         centre: (2,) where in the picture the view looks, about; None looks anywhere that keeps it within the picture.
     """
@@ -71,7 +83,17 @@ def _random_quad(rng: np.random.Generator, settings: ViewSettings, corners: Floa
 
 
 def warp_image(image: np.ndarray, H: Float64, width: int, height: int) -> np.ndarray:
-    """The view (height, width) of an image; what lies outside it is mirrored, so that no edge appears there."""
+    """The view of an image. What lies outside it is mirrored, so that no edge appears there.
+
+    Args:
+        image: (H, W).
+        H: (3, 3) image to view.
+        width: of the view, pixels.
+        height: of the view, pixels.
+
+    Returns:
+        (height, width).
+    """
     return cv2.warpPerspective(image, H, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
 
 

@@ -19,7 +19,13 @@ from improvo.types import Float32
 def widen(
     tensors: Mapping[str, Float32], source: Architecture, target: Architecture, rng: np.random.Generator
 ) -> dict[str, Float32]:
-    """Tensors of `target` that compute what `tensors` of `source` compute; descriptors keep their cosines.
+    """Tensors of a wide network that compute what those of a narrow one compute; descriptors keep their cosines.
+
+    Args:
+        tensors: of the narrow network, by name.
+        source: the narrow architecture.
+        target: the wide architecture.
+        rng: how the copies of a channel differ.
 
     Raises:
         InputError: a width of the target is not a multiple of the source's, or the normalisation differs.

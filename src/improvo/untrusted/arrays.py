@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Callable, Iterable
 from math import prod
 from pathlib import Path
+from tokenize import TokenError
 from typing import IO, Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from improvo.untrusted.text import reason
 
 FAULTS: tuple[type[Exception], ...] = (  # what reading a damaged archive may raise
     *(OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, MemoryError, OverflowError),
-    *(RuntimeError, SyntaxError, zipfile.BadZipFile, zlib.error),
+    *(RuntimeError, SyntaxError, TokenError, zipfile.BadZipFile, zlib.error),
 )
 
 

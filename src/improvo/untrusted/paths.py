@@ -11,6 +11,15 @@ from improvo.errors import InputError
 _REASONS = {errno.ENAMETOOLONG: "the name is too long", errno.ELOOP: "is a link that leads to itself"}
 
 
+def is_text(path: Path) -> bool:
+    """Whether a name is text; Linux takes any bytes, which Python shows as halves of surrogates."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def check_path(path: Path) -> Path:
     """The path, if the system can look it up; whether something is there does not matter.
 

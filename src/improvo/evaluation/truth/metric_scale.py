@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from improvo.errors import InputError
-from improvo.evaluation.depth import depth_at
 from improvo.evaluation.trajectory.relative import path_lengths
 from improvo.evaluation.truth.structure_from_motion import ReconstructedImage
 from improvo.geometry.alignment import align_points
+from improvo.geometry.depth_sampling import depth_at
 from improvo.types import Float32, Float64
 
 ROBUST = 1.4826  # median absolute deviation to standard deviation

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from improvo.evaluation.depth import depth_at
 from improvo.evaluation.pose.estimators import with_poselib
 from improvo.evaluation.truth.structure_from_motion import ReconstructedImage
 from improvo.geometry.camera import Camera
+from improvo.geometry.depth_sampling import depth_at
 from improvo.geometry.se3 import inverse, rotation_angle_deg
 from improvo.types import Float32, Float64
 

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from improvo.errors import InputError, MissingExtraError
 from improvo.evaluation.truth.settings import TruthSettings
-from improvo.files import written_atomically
+from improvo.files import write_picture
 from improvo.geometry.camera import Camera
 from improvo.geometry.camera_files import colmap_calibration
 from improvo.sequences import Sequence as FrameSequence
@@ -177,8 +176,7 @@ def _write_images(sequence: FrameSequence, folder: Path, progress: Progress) -> 
                 image = grey(sequence.recording.image(index))
             except UnreadableFrameError:
                 continue
-            with written_atomically(folder / name) as temporary:
-                cv2.imwrite(str(temporary), image)
+            write_picture(folder / name, image)
         names.append(name)
         progress("images", done + 1, len(sequence))
     return names

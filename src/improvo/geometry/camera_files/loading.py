@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ from improvo.geometry.camera_files.containers import parse_npz, parse_tree
 from improvo.geometry.camera_files.plain_text import from_plain_text, is_plain
 from improvo.geometry.camera_files.tree import cameras
 from improvo.geometry.text_files import read_text
+from improvo.untrusted.paths import check_path
 
 IN_FOLDERS = ("camera.yaml", "camera.yml", "camera.json", "camera.txt")
 _UNSAFE = (".pkl", ".pickle", ".npy", ".mat", ".m", ".py", ".sfm")
@@ -32,9 +34,9 @@ def load_calibration(text: str, camera: str | None = None) -> Calibration:
         InputError: no such file, not a calibration, a value that cannot be, or a key that could be distortion, a model
             or a size and is not understood.
     """
-    if re.fullmatch(r"[\s\d.,;eE+-]+", text) and re.search(r"[,;\s]", text.strip()) and not Path(text).is_file():
+    if re.fullmatch(r"[\s\d.,;eE+-]+", text) and re.search(r"[,;\s]", text.strip()) and not os.path.isfile(text):
         return from_numbers(text)
-    path = Path(text)
+    path = check_path(Path(text))
     if not path.exists() and "#" in text:
         name, _, camera = text.rpartition("#")
         path = Path(name)
@@ -96,8 +98,8 @@ def _one_line(source: str) -> Iterator[None]:
         yield
     except KeyError as error:
         raise InputError(f"{source}: has no {error.args[0]}; {MEND}") from None
-    except (ValueError, TypeError, IndexError, AttributeError) as error:
-        reason = str(error)
+    except (ValueError, TypeError, IndexError, AttributeError, ArithmeticError, RecursionError) as error:
+        reason = " ".join(str(error).split())
         if re.search(r"no number but|invalid literal|could not convert|object|attribute|index", reason):
             reason = f"a value is not what it should be ({reason})"
         raise InputError(f"{source}: {reason}" + ("" if ";" in reason else f"; {MEND}")) from None

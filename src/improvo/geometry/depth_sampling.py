@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from improvo.errors import ConfigError
-from improvo.evaluation.settings import SAMPLINGS
 from improvo.types import Float32, Float64
+
+SAMPLINGS = ("bilinear", "nearest")
 
 
 def depth_at(keypoints: Float32, depth: Float32, sampling: str = "bilinear", edge: float = 0.05) -> Float64:

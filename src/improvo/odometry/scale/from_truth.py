@@ -1,0 +1,96 @@
+"""Scale by a trajectory in metres: the recording's true poses, or a track of positions from elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from improvo.errors import InputError
+from improvo.geometry.alignment import align_points
+from improvo.geometry.trajectory_files import read_trajectory
+from improvo.odometry.scale.estimate import ScaleEstimate, from_measurements
+from improvo.odometry.scale.settings import ScaleSettings
+from improvo.odometry.scale.tracked import TrackedRun
+from improvo.sequences import Sequence
+from improvo.sequences.association import poses_at
+from improvo.types import Float64, Trajectory
+
+_STRETCHES = 10  # of a segment, whose lengths are compared
+_LEAST_MOVE = 0.1  # of the longest stretch; shorter ones say little
+_MOST_ERROR = 0.4  # of its own extent, after alignment, beyond which the two do not belong together
+
+
+def reference_of(sequence: Sequence, settings: ScaleSettings) -> Trajectory:
+    """The trajectory in metres, at the times of the sequence's frames, before any work.
+
+    Raises:
+        InputError: there is none, or it has no pose at their times.
+    """
+    truth = sequence.ground_truth
+    name = str(sequence.path)
+    if settings.reference is not None:
+        name = settings.reference
+        truth = poses_at(read_trajectory(settings.reference), sequence.times)
+    if truth is None:
+        raise InputError(
+            f"--scale truth: {name} has no true poses; give a trajectory in metres (--scale truth FILE) or take "
+            "another source"
+        )
+    if truth.valid.sum() < 3:
+        raise InputError(
+            f"--scale truth: {name} has poses at the times of {int(truth.valid.sum())} frames, three are needed; "
+            "bring both to one clock, in seconds"
+        )
+    return truth
+
+
+def scale_from_truth(run: TrackedRun, reference: Trajectory) -> dict[int, ScaleEstimate]:
+    """By segment, where it has three frames with a true pose and moves.
+
+    Raises:
+        InputError: no segment has, or the trajectories do not fit each other.
+    """
+    rows = np.array([run.row(frame) for frame in range(len(run.trajectory))], np.int64)
+    metric = np.where(reference.valid[rows, None], reference.camera_centers[rows], np.nan)
+    found = {}
+    for segment in run.segments:
+        frames = run.frames(segment)
+        frames = frames[np.isfinite(metric[frames]).all(axis=1)]
+        own, given = run.trajectory.camera_centers[frames], metric[frames]
+        if len(frames) < 3 or not _moves(own) or not _moves(given):
+            continue
+        motion = align_points(given, own, with_scale=True)
+        error, extent = _rms(motion.apply(own) - given), _rms(given - given.mean(axis=0))
+        if motion.scale <= 0 or error > _MOST_ERROR * extent:
+            raise InputError(
+                f"--scale truth: does not fit the run, {error:.3g} m off where it spreads over {extent:.3g} m; are "
+                "they of one recording, and on one clock?"
+            )
+        stretches = _stretches(own, given)
+        if len(stretches[0]) < 3:
+            found[segment] = ScaleEstimate(motion.scale, None, len(frames))
+            continue
+        spread = from_measurements(*stretches)
+        found[segment] = replace(spread, metres_per_unit=motion.scale, measurements=len(frames))
+    if not found:
+        raise InputError(
+            "--scale truth: no segment of the run moves and has three frames with a true pose; take another source"
+        )
+    return found
+
+
+def _rms(offsets: Float64) -> float:
+    return float(np.sqrt(np.mean(np.sum(offsets**2, axis=1))))
+
+
+def _moves(centres: Float64) -> bool:
+    return bool(np.ptp(centres, axis=0).max() > 1e-9)
+
+
+def _stretches(own: Float64, given: Float64) -> tuple[Float64, Float64]:
+    """Ratios (K,) of the distances between frames some way apart, and where they begin (K,)."""
+    step = max(1, len(own) // _STRETCHES)
+    mine, theirs = (np.linalg.norm(centres[step:] - centres[:-step], axis=1) for centres in (own, given))
+    far = mine > _LEAST_MOVE * mine.max()
+    return theirs[far] / mine[far], np.flatnonzero(far).astype(np.float64)

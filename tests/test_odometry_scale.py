@@ -1,0 +1,290 @@
+"""Runs in metres: each source against the true size of a rendered room, in every output; contradictions."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rendered_walk
+from rendered_walk import _TEXTURE, CAMERA, _texture, render_with_depth
+from simulated_features import hand_motion
+
+from improvo.cli.main import main
+from improvo.errors import ConfigError, InputError
+from improvo.geometry import se3
+from improvo.geometry.alignment import align_points
+from improvo.geometry.trajectory_files import read_trajectory, write_trajectory
+from improvo.odometry.map_file import read_map
+from improvo.odometry.run import RunSummary
+from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.scale.apply import apply_scale, segment_maps
+from improvo.odometry.scale.estimate import ScaleEstimate, from_measurements
+from improvo.odometry.scale.from_height import ground_plane
+from improvo.odometry.scale.settings import ScaleSettings, scale_settings
+from improvo.odometry.scale.sources import scale_source
+from improvo.sequences import Sequence, open_sequence
+from improvo.simulation.tum_writer import TumRgbdWriter
+from improvo.stability.tables import POINTS_FILE, read_points
+from improvo.types import Float64, Trajectory, UInt8
+
+FRAMES = 36
+MARKER = 0.8  # metres
+SIZE = 1.7  # the room is this much larger than `rendered_walk` has it, so that nothing is right by chance
+WALLS = (  # corner and edges of each: back, floor, right, left, a small panel with the marker
+    ((-4.0, -2.0, 4.5), (8.0, 0.0, 0.0), (0.0, 3.0, 0.0)),
+    ((-4.0, 0.9, 4.5), (8.0, 0.0, 0.0), (0.0, 0.0, -6.0)),
+    ((4.0, -2.0, 4.5), (0.0, 0.0, -6.0), (0.0, 3.0, 0.0)),
+    ((-4.0, -2.0, -1.5), (0.0, 0.0, 6.0), (0.0, 3.0, 0.0)),
+    ((-0.9, -0.1, 2.0), (0.9, 0.0, 0.2), (0.0, 0.8, 0.0)),
+)
+
+
+def with_marker(texture: UInt8) -> UInt8:
+    """The small panel in front, with a marker of the dictionary 5X5 on it."""
+    _, along, down = WALLS[4]
+    sides = [round(MARKER / SIZE / float(np.linalg.norm(edge)) * (_TEXTURE - 1)) for edge in (along, down)]
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    marker = cv2.resize(cv2.aruco.generateImageMarker(dictionary, 7, 350), sides, interpolation=cv2.INTER_AREA)
+    result, (left, top) = texture.copy(), (120, 90)
+    result[top - 25 : top + sides[1] + 25, left - 25 : left + sides[0] + 25] = 255
+    result[top : top + sides[1], left : left + sides[0]] = marker
+    return result
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording with depth and true poses, in metres, with a marker in view."""
+    folder = tmp_path_factory.mktemp("room") / "room"
+    rng = np.random.default_rng(0)
+    textures = [_texture(rng) for _ in WALLS]
+    textures[4] = with_marker(textures[4])
+    own, rendered_walk._WALLS = rendered_walk._WALLS, WALLS
+    with TumRgbdWriter(folder, CAMERA, fps=30.0, depth_scale=1000.0) as writer:
+        for number, pose in enumerate(hand_motion(FRAMES, step=0.025)):
+            image, depth = render_with_depth(se3.inverse(pose), textures)
+            metric = pose.copy()
+            metric[:3, 3] *= SIZE
+            measured = np.where(np.isfinite(depth), SIZE * depth, np.nan).astype(np.float32)
+            writer.add(number / 30, image, measured, metric)
+    rendered_walk._WALLS = own
+    return folder
+
+
+@pytest.fixture(scope="module")
+def up_to_scale(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output folder of a run without a scale; not to be written to."""
+    out = tmp_path_factory.mktemp("run") / "out"
+    assert main(["run", str(room), "-o", str(out), "--frontend", "sift", "--max-keypoints", "800", "--quiet"]) == 0
+    return out
+
+
+@pytest.fixture
+def finished(up_to_scale: Path, tmp_path: Path) -> tuple[Sequence, RunSummary]:
+    folder = tmp_path / "out"
+    shutil.copytree(up_to_scale, folder)
+    run = RunFolder(folder)
+    assert run.frames == len(run.trajectory)
+    return run.sequence, RunSummary(folder, run.trajectory, run.report)
+
+
+def error_of_size(trajectory: Trajectory, truth: Trajectory | None) -> float:
+    """How much too large a trajectory is, as a share."""
+    assert truth is not None
+    return 1 / align_points(truth.camera_centers, trajectory.camera_centers, with_scale=True).scale - 1
+
+
+def distance_between(sequence: Sequence, a: int, b: int) -> float:
+    truth = sequence.ground_truth
+    assert truth is not None
+    return float(np.linalg.norm(truth.camera_centers[a] - truth.camera_centers[b]))
+
+
+def heights(sequence: Sequence) -> Float64:
+    truth = sequence.ground_truth
+    assert truth is not None
+    return WALLS[1][0][1] * SIZE - truth.camera_centers[:, 1]
+
+
+SOURCES: dict[str, tuple[Callable[[Sequence], ScaleSettings], float]] = {
+    "depth": (lambda sequence: ScaleSettings("depth"), 0.03),
+    "truth": (lambda sequence: ScaleSettings("truth"), 1e-6),
+    "distance": (lambda sequence: ScaleSettings("distance", distance_between(sequence, 3, 33), (3, 33)), 0.03),
+    "height": (lambda sequence: ScaleSettings("height", float(np.median(heights(sequence)))), 0.05),
+    "marker": (lambda sequence: ScaleSettings("marker", MARKER), 0.03),
+}
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_every_source_gives_the_true_size_in_every_output(source: str, finished: tuple[Sequence, RunSummary]) -> None:
+    sequence, run = finished
+    make, tolerance = SOURCES[source]
+    settings = make(sequence)
+    ask = scale_source(sequence, settings)
+    assert ask is not None
+    points_before, map_before = read_points(run.folder / POINTS_FILE), read_map(run.folder / "map.ply")
+    scaled = apply_scale(sequence, run, ask, settings)
+    assert abs(error_of_size(run.trajectory, sequence.ground_truth)) > 0.1
+    assert abs(error_of_size(scaled.trajectory, sequence.ground_truth)) < tolerance
+    entry = scaled.report["metric"]["segments"][0]
+    factor = entry["metres_per_unit"]
+    written = read_trajectory(run.folder / "trajectory.txt")
+    np.testing.assert_allclose(written.world_from_cam, scaled.trajectory.world_from_cam, atol=1e-9)
+    np.testing.assert_allclose(read_map(run.folder / "map.ply").xyz, factor * map_before.xyz, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(read_points(run.folder / POINTS_FILE).xyz, factor * points_before.xyz)
+    assert "camera-to-world, metres" in (run.folder / "trajectory.txt").read_text().splitlines()[0]
+    assert b"map, metres" in (run.folder / "map.ply").read_bytes()[:200]
+    assert RunFolder(run.folder).unit.startswith("metres")
+    assert scaled.unit == RunFolder(run.folder).unit
+    assert entry["relative_error"] is None or 0 <= entry["relative_error"] < 0.05
+
+
+def test_the_command_writes_metres_everywhere(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    given = ["run", str(room), "-o", str(out), "--frontend", "sift", "--max-keypoints", "800", "--max-frames", "24"]
+    assert main([*given, "--scale", "marker", str(MARKER), "--dense", "--report"]) == 0
+    text = capsys.readouterr().out
+    assert "unit: metres, from markers of known size" in text
+    truth = open_sequence(room, max_frames=24).ground_truth
+    assert abs(error_of_size(read_trajectory(out / "trajectory.txt"), truth)) < 0.05
+    report = json.loads((out / "run.json").read_text())
+    assert report["configuration"]["scale"]["metres"] == MARKER
+    assert b"dense points, metres" in (out / "dense.ply").read_bytes()[:200]
+    page = (out / "report.html").read_text()
+    assert "map are metres" in page
+    assert "path of the camera" in page
+    assert main(["export", "colmap", str(out), "-o", str(tmp_path / "colmap")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (["depths"], "give depth | truth"),
+        (["distance", "3", "9"], "give depth | truth"),
+        (["distance", "3", "9", "far"], "not numbers"),
+        (["distance", "3", "3", "1"], "no two places"),
+        (["distance", "3", "99", "1"], "frame 99 is not among those that are read"),
+        (["height", "-1.5"], "is no length"),
+        (["height", "0"], "is no length"),
+        (["truth", "nothing.txt"], "nothing.txt"),
+    ],
+)
+def test_bad_words_are_one_line_before_any_work(
+    room: Path, tmp_path: Path, words: list[str], what: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", str(room), "-o", str(tmp_path / "out"), "--scale", *words]) == 2
+    error = capsys.readouterr().err.strip()
+    assert what in error
+    assert "\n" not in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_source_that_is_not_there_is_said_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from rendered_walk import write_walk
+
+    walk = write_walk(tmp_path / "walk", frames=5)
+    for words, what in (
+        (["depth"], "has no depth images"),
+        (["truth"], "has no true poses"),
+        (["marker", "0.16"], "no marker was seen"),
+    ):
+        assert main(["run", str(walk), "-o", str(tmp_path / "out"), "--scale", *words, "--quiet"]) == 2
+        assert what in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_contradictions_leave_the_run_as_it_is(
+    finished: tuple[Sequence, RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence, run = finished
+    before = {file.name: file.read_bytes() for file in run.folder.iterdir() if file.is_file()}
+    truth = sequence.ground_truth
+    assert truth is not None
+    rng = np.random.default_rng(0)
+    other = np.array(truth.world_from_cam)
+    other[:, :3, 3] = rng.normal(size=(len(other), 3))
+    write_trajectory(tmp_path / "other.txt", replace(truth, world_from_cam=other))
+    depth = type(sequence).depth
+
+    def wrong(self: Sequence, i: int) -> object:
+        found = depth(self, i)
+        return None if found is None else found * (1 + 2 * (i % 3))
+
+    monkeypatch.setattr(type(sequence), "depth", wrong)
+    for settings, what in (
+        (ScaleSettings("depth"), "contradicts itself"),
+        (ScaleSettings("truth", reference=str(tmp_path / "other.txt")), "does not fit the run"),
+    ):
+        ask = scale_source(sequence, settings)
+        assert ask is not None
+        with pytest.raises(InputError, match=what):
+            apply_scale(sequence, run, ask, settings)
+    assert before == {file.name: file.read_bytes() for file in run.folder.iterdir() if file.is_file()}
+
+
+def test_each_segment_is_scaled_about_where_it_began() -> None:
+    poses = np.tile(np.eye(4), (7, 1, 1))
+    poses[:, 0, 3] = [0, 1, 2, 2, 2.5, 3, np.nan]
+    poses[6] = np.nan
+    segment = np.array([0, 0, 0, 1, 1, 1, -1])
+    trajectory = Trajectory(np.arange(7.0), poses, segment)
+    maps = segment_maps(trajectory, {0: ScaleEstimate(10.0, None, 1), 1: ScaleEstimate(4.0, None, 1)})
+    assert maps[0].apply(np.array([2.0, 0, 0])).tolist() == [20, 0, 0]
+    assert maps[1].apply(np.array([2.0, 0, 0])).tolist() == [20, 0, 0]
+    assert maps[1].apply(np.array([3.0, 0, 0])).tolist() == [24, 0, 0]
+    assert segment_maps(trajectory, {0: ScaleEstimate(10.0, None, 1)})[1].factor == 10.0
+
+
+def test_the_error_of_a_median_and_its_change() -> None:
+    rng = np.random.default_rng(0)
+    medians, errors = [], []
+    for _ in range(200):
+        found = from_measurements(2 + 0.1 * rng.normal(size=400), np.arange(400.0))
+        medians.append(found.metres_per_unit)
+        errors.append(2 * found.relative_error)
+    assert 0.5 < np.median(errors) / np.std(medians) < 2
+    drifting = from_measurements(np.linspace(1.0, 1.3, 90), np.arange(90.0))
+    assert drifting.change == pytest.approx(1.25 / 1.05 - 1, abs=0.01)
+    assert from_measurements(np.array([2.0]), np.array([0.0])).relative_error is None
+
+
+def test_the_ground_is_the_lowest_plane_and_not_the_table() -> None:
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(-4, 4, 300), np.full(300, 1.5), rng.uniform(0, 8, 300)])
+    table = np.column_stack([rng.uniform(-1, 1, 150), np.full(150, 0.7), rng.uniform(1, 3, 150)])
+    wall = np.column_stack([rng.uniform(-4, 4, 400), rng.uniform(-2, 1.5, 400), np.full(400, 8.0)])
+    points = np.concatenate([floor, table, wall]) + 0.01 * rng.normal(size=(850, 3))
+    centres = np.column_stack([np.linspace(-1, 1, 10), np.zeros(10), np.zeros(10)])
+    down = np.array([0.0, np.cos(0.3), -np.sin(0.3)])  # the camera looks down a little
+    found = ground_plane(points, centres, down, rng)
+    assert found is not None
+    assert found[1] == pytest.approx(1.5, abs=0.02)
+    assert ground_plane(wall, centres, down, rng) is None
+
+
+def test_settings_are_checked() -> None:
+    assert scale_settings(["truth", "a b.txt"]) == ["scale.source=truth", "scale.reference='a b.txt'"]
+    for wrong in (
+        {"source": "inches"},
+        {"source": "height"},
+        {"source": "distance", "metres": 1.0},
+        {"source": "depth", "frames": (1, 2)},
+        {"source": "marker", "metres": float("nan")},
+    ):
+        with pytest.raises(ConfigError):
+            ScaleSettings(**wrong)  # type: ignore[arg-type]
+
+
+def test_from_python_with_the_settings_of_a_run(room: Path, tmp_path: Path) -> None:
+    import improvo
+    from improvo.depth.run_settings import DenseRunSettings
+    from improvo.frontend.settings import FrontendSettings
+
+    settings = DenseRunSettings(frontend=FrontendSettings("sift", 800), scale=ScaleSettings("truth"))
+    found = improvo.run(room, tmp_path / "out", settings)
+    assert abs(error_of_size(found.trajectory, open_sequence(room).ground_truth)) < 1e-6

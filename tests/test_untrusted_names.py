@@ -1,0 +1,167 @@
+"""Names and numbers that programs trip over: refused in one line, or read as what they are."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+import cv2
+import pytest
+
+from improvo import config
+from improvo.cli.main import main
+from improvo.errors import ConfigError, ImprovoError, InputError, OutputError
+from improvo.files import check_output_folder, write_text
+from improvo.geometry.camera_files import calibration_yaml, load_calibration
+from improvo.geometry.trajectory_files import read_times, read_trajectory
+from improvo.odometry.run_settings import RunSettings
+from improvo.sequences import open_sequence
+from improvo.sequences.images import natural_key
+from improvo.sequences.opening import FORMATS
+from improvo.untrusted.text import load_json, load_yaml
+from sequence_builders import CAMERA, images, write_images
+
+DIGITS = "9" * 5000
+
+
+def refused(call: object, *arguments: object) -> str:
+    with pytest.raises(ImprovoError) as error:
+        call(*arguments)  # type: ignore[operator]
+    message = str(error.value)
+    assert "\n" not in message
+    assert len(message) < 1000
+    return message
+
+
+def looped(folder: Path) -> Path:
+    os.symlink(folder / "b", folder / "a")
+    os.symlink(folder / "a", folder / "b")
+    return folder / "a"
+
+
+@pytest.mark.parametrize("name", ["a\0b", "x" * 300, "x" * 5000, "loop", "loop/x.mp4", "\udcff\ud800.mp4"])
+def test_a_path_that_no_system_can_look_up(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    path = looped(tmp_path) if name == "loop" else tmp_path / name
+    if name == "loop/x.mp4":
+        path = looped(tmp_path) / "x.mp4"
+    for call in (
+        open_sequence,
+        lambda path: load_calibration(str(path)),
+        read_trajectory,
+        lambda p: config.load(RunSettings, p),
+    ):
+        refused(call, path)
+    assert main(["run", str(path), "-o", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["a\0b", "x" * 300])
+def test_an_output_that_no_system_can_make(tmp_path: Path, name: str) -> None:
+    with pytest.raises(OutputError):
+        check_output_folder(tmp_path / name, "run")
+    with pytest.raises((OutputError, ValueError)):
+        write_text(tmp_path / name, "x")
+
+
+def test_a_name_of_255_bytes_can_be_written(tmp_path: Path) -> None:
+    write_text(tmp_path / ("x" * 251 + ".txt"), "y")
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["y"]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_names_with_odd_digits(tmp_path: Path, suffix: str) -> None:
+    pictures = images(6)
+    names = ["1²3", "٣", "12", "2", "9" * 240, "½"]
+    write_images(tmp_path, pictures, "{}" + suffix)
+    for number, name in enumerate(names):
+        (tmp_path / f"{number}{suffix}").rename(tmp_path / f"x{name}{suffix}")
+    (tmp_path / "camera.yaml").write_text(calibration_yaml(CAMERA))
+    assert len(open_sequence(tmp_path, fps=1.0)) >= 1
+    for format in FORMATS:
+        with suppress(ImprovoError):  # a format that it is not
+            open_sequence(tmp_path, format=format, fps=1.0)
+
+
+def test_natural_order_of_any_numbers() -> None:
+    names = ["a1", "a2", "a02", "a10", "a1²3", "b", "a" + DIGITS, "a" + "9" * 4000]
+    ordered = sorted(names, key=natural_key)
+    assert ordered[:2] == ["a1", "a1²3"]
+    assert ordered.index("a2") < ordered.index("a10") < ordered.index("a" + "9" * 4000) < ordered.index("a" + DIGITS)
+
+
+def test_a_file_whose_name_is_no_text(tmp_path: Path) -> None:
+    """Linux takes any bytes; they go through the outputs and back."""
+    folder = os.fsencode(tmp_path / "room") + b"\xff"
+    os.mkdir(folder)
+    room = Path(os.fsdecode(folder))
+    for number, image in enumerate(images(3)):
+        (room / f"{number}.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    (room / "camera.yaml").write_text(calibration_yaml(CAMERA))
+    assert len(open_sequence(room, fps=1.0)) == 3
+    (room / "v.mp4").write_bytes(bytes(99))
+    with pytest.raises(ImprovoError, match="rename it"):
+        open_sequence(room / "v.mp4", fov=60.0)
+    write_text(tmp_path / "page.html", f"of {room}")
+    assert (tmp_path / "page.html").read_bytes().endswith(b"room\xff")
+
+
+@pytest.mark.parametrize(
+    "number", [DIGITS, "1e999", ".inf", "-.inf", ".nan", "2001-99-99", "0o9", "1_0", "[1]", "''", "~"]
+)
+def test_a_number_that_is_none(tmp_path: Path, number: str) -> None:
+    good = calibration_yaml(CAMERA)
+    for key in ("width", "fx", "cx"):
+        value = next(line for line in good.splitlines() if line.startswith(f"{key}:"))
+        (tmp_path / "c.yaml").write_text(good.replace(value, f"{key}: {number}"))
+        if number != "1_0":
+            refused(load_calibration, str(tmp_path / "c.yaml"))
+    (tmp_path / "run.yaml").write_text(f"frontend:\n  max_keypoints: {number}\n")
+    if number != "1_0":
+        with pytest.raises(ConfigError) as error:
+            config.load(RunSettings, tmp_path / "run.yaml")
+        assert "\n" not in str(error.value)
+        with pytest.raises(ConfigError):
+            config.load(RunSettings, overrides=[f"frontend.max_keypoints={number}"])
+    (tmp_path / "times.txt").write_text(f"0\n{number}\n")
+    if number != "1_0":
+        with pytest.raises(InputError):
+            read_times(tmp_path / "times.txt")
+
+
+@pytest.mark.parametrize(
+    "text", ["2001-99-99", "a: 2001-99-99 25:61:61", "? [1]\n: 2", "!!int x", "!!float y", "? {a: 1}\n: 2"]
+)
+def test_yaml_that_python_cannot_build(text: str) -> None:
+    with pytest.raises(ValueError, match=r".") as error:
+        load_yaml(text)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", [DIGITS, "[" * 100_000, "{", "", "\ud800"])
+def test_json_that_python_cannot_build(text: str) -> None:
+    with pytest.raises(ValueError, match=r"."):
+        load_json(text)
+
+
+@pytest.mark.parametrize(
+    "script",
+    [
+        "ffconcat version 1.0\nfile {0}\n",
+        "\ufeff  ffconcat version 1.0\nfile {0}\n",
+        "#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\n{0}\n",
+        "v=0\no=- 0 0 IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\n",
+        "<?xml version='1.0'?><MPD>{0}</MPD>",
+        "ffconcat version 1.0\nfile {0}\n#\0",
+        "hello\n",
+    ],
+)
+@pytest.mark.parametrize("suffix", [".mp4", ".avi", ".mkv"])
+def test_a_text_that_calls_itself_a_video(tmp_path: Path, script: str, suffix: str) -> None:
+    from sequence_builders import write_video
+
+    write_video(tmp_path / "secret.avi", images(3))
+    (tmp_path / f"v{suffix}").write_text(script.replace("{0}", "secret.avi"))
+    assert "not a video" in refused(lambda path: open_sequence(path, fov=60.0), tmp_path / f"v{suffix}")
+    assert len(open_sequence(tmp_path / "secret.avi", fov=60.0)) == 3
