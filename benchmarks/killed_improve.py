@@ -27,8 +27,8 @@ from improvo.simulation import bundled_sequence
 TABLES = ("tracks.parquet", "points.parquet", "frames.parquet", "trajectory.txt")
 OPTIONS = [
     *("--frontend", "superpoint-small", "--steps", "20", "--batch-size", "2"),
-    *("--set", "split.share=0.4", "--set", "validation.survival.pairs=10", "--set", "validation.calibration_images=4"),
-    *("--set", "training.optimiser.checkpoint_minutes=0", "--set", "training.optimiser.log_every=1"),
+    *("--set", "split.share=0.4", "--set", "validation.matches.pairs=10", "--set", "validation.calibration_images=4"),
+    *("--set", "held.optimiser.checkpoint_minutes=0", "--set", "held.optimiser.log_every=1", "--control"),
 ]
 
 

@@ -19,7 +19,7 @@ from improvo.cli.train_options import read_data_card
 from improvo.frontend.quantisation import calibrate
 from improvo.frontend.weights import BUNDLED, DataSource, Weights, find_weights, load_weights, save_weights
 
-FIGURES = ("pairs", "rotation_success", "translation_success", "precision", "precision_8px")
+FIGURES = ("pairs", "rotation_success", "translation_success", "right_share_3px", "right_share_8px")
 NO_HEAD = "The stability head is not part of these weights: only VO adaptation can teach it. "
 ATTRIBUTION = (
     "All frames were converted to greyscale, reduced and re-compressed. The authors of the data sets do not endorse "

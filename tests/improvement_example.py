@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from improvo.evaluation.settings import SurvivalSettings
+from improvo.evaluation.pose.self_truth import SelfTruthSettings
 from improvo.files import make_output_folder, write_json
 from improvo.frontend.settings import FrontendSettings
 from improvo.frontend.weights import Weights, find_weights, load_weights, save_weights
 from improvo.improvement.improve import Improvement, improve
+from improvo.improvement.recipe import TrainingJob
 from improvo.improvement.settings import ImproveSettings, SplitSettings, ValidationSettings
 from improvo.odometry.settings import OdometrySettings, StartSettings
 from improvo.stability.settings import LabelSettings
-from improvo.training.settings import OdometryTrainingSettings
 
 SPOILED = "spoiled"  # stands for bundled weights with so much noise that a sixth of the matches is lost
 SETTINGS = ImproveSettings(
@@ -32,7 +32,7 @@ SETTINGS = ImproveSettings(
     odometry=OdometrySettings(start=StartSettings(max_homography_ratio=0.9)),  # the room is mostly one wall
     split=SplitSettings(0.3),
     validation=ValidationSettings(
-        SurvivalSettings(gaps=(4, 8), pairs=6, min_pairs=2, max_keypoints=250), calibration_images=2
+        SelfTruthSettings(pairs=6, max_keypoints=250, shuffles=2), gaps=(4, 8), min_pairs=2, calibration_images=2
     ),
 )
 NOISE = (0.0, 0.5)  # of the first round, which gives the bundled weights back, and of the second, which ruins them
@@ -50,25 +50,27 @@ class FakeTraining:
         self.noise, self.seconds = noise, seconds
         self.calls: list[dict[str, Any]] = []
 
-    def __call__(
-        self,
-        labels: Sequence[Path],
-        settings: OdometryTrainingSettings,
-        output: Path,
-        start: Path,
-        data: Any = (),
-        progress: bool = True,
-    ) -> dict[str, Any]:
-        self.calls.append({"labels": list(labels), "seed": settings.optimiser.seed, "start": start})
-        make_output_folder(output, "train odometry")
+    def __call__(self, job: TrainingJob) -> dict[str, Any]:
+        output, seed = job.output, job.seed
+        seen = [one.labeled.frames.source_index[one.fixed_run().has_depth].tolist() for one in job.reference]
+        self.calls.append(
+            {
+                "labels": [job.labels],
+                "seed": seed,
+                "start": job.start,
+                "seen": seen,
+                "control": job.control,
+                "steps": job.steps,
+            }
+        )
+        make_output_folder(output, "train held")
         for part in range(20):  # as steps: something to interrupt
             time.sleep(self.seconds / 20)
             write_json(output / "checkpoint.json", part)
-        seed = settings.optimiser.seed
         weights = noisy(self.noise[min(seed, len(self.noise) - 1)], seed)
         rows = [{"step": step, "loss": 1.0 / step} for step in (1, 2, 3)]
         (output / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-        card = replace(weights.card, activation_ranges={}, training={"stage": "odometry", "seconds": 1})
+        card = replace(weights.card, activation_ranges={}, training={"stage": "odometry", "seconds": 1, "steps": 3})
         save_weights(output / "weights.safetensors", weights.tensors, card)
         return rows[-1]
 

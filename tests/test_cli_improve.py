@@ -18,14 +18,8 @@ from improvo.improvement.settings import ImproveSettings
 
 OPTIONS = [
     *("--frontend", "superpoint-small", "--max-keypoints", "250", "--set", "labels.min_observations=6"),
-    *(
-        "--set",
-        "validation.survival.gaps=[4,8]",
-        "--set",
-        "validation.survival.pairs=6",
-        "--set",
-        "validation.survival.min_pairs=2",
-    ),
+    *("--set", "validation.gaps=[4,8]", "--set", "validation.matches.pairs=6", "--set", "validation.min_pairs=2"),
+    *("--set", "validation.matches.shuffles=2"),
     *("--set", "split.share=0.3", "--set", "validation.calibration_images=2"),
     *("--set", "odometry.start.max_homography_ratio=0.9"),  # the room is mostly one wall
 ]
@@ -40,13 +34,13 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def training(monkeypatch: pytest.MonkeyPatch) -> FakeTraining:
     """In place of the real training, which has a test of its own."""
     fake = FakeTraining()
-    monkeypatch.setattr("improvo.improvement.improve._train_odometry", fake)
+    monkeypatch.setattr("improvo.improvement.improve._train", fake)
     return fake
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     capsys.readouterr()
-    assert main(["improve", *map(str, words), *OPTIONS]) == 2
+    assert main(["improve", *OPTIONS, "--set", "labels.min_observations=6", *map(str, words)]) == 2
     message = capsys.readouterr().err.strip().splitlines()[-1]
     assert message.startswith("improvo: ")
     return message
@@ -68,14 +62,16 @@ def test_improve_says_what_it_did_and_where_the_result_is(
     assert main(words) == 0
     text = capsys.readouterr().out
     assert "held back, never trained on: the last 12 of 40 frames of room" in text
-    assert "matches survive 4 / 8 frames" in text
+    assert "of its matches are right within 8 px at 4 frames (0.133 s), 8 frames (0.267 s)" in text
+    assert "estimate: about " in text
     assert "12 of 12 frames tracked" in text
     assert f"weights in {out / 'weights.safetensors'}" in text
     assert (out / "report.html").is_file()
     assert [call["seed"] for call in training.calls] == [7]
     settings = yaml.safe_load((out / "settings.yaml").read_text())
-    assert settings["training"]["optimiser"]["steps"] == 90
-    assert settings["training"]["optimiser"]["decay_steps"] == 30
+    for recipe in ("held", "training"):
+        assert settings[recipe]["optimiser"]["steps"] == 90
+        assert settings[recipe]["optimiser"]["decay_steps"] == 30
     assert settings["odometry"]["seed"] == 7
     assert main(["run", str(walk), "-o", str(tmp_path / "run"), "--frontend", str(out / "weights.safetensors")]) == 0
 
@@ -101,6 +97,14 @@ def test_what_shows_no_depth_is_explained(
     assert not training.calls
 
 
+def test_what_is_too_short_to_be_judged_is_said_before_training(
+    walk: Path, training: FakeTraining, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = (walk, "-o", tmp_path / "out", "--end", "30", "--set", "validation.gaps=[20]")
+    assert "has no pair of frames with poses and depth; hold back a longer" in refused(capsys, *words)
+    assert not training.calls
+
+
 def test_a_scene_cut_is_labelled_on_both_sides(
     walk: Path, training: FakeTraining, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -116,6 +120,10 @@ def test_bad_arguments_are_one_line(
 ) -> None:
     out = tmp_path / "out"
     assert "no such file" in refused(capsys, tmp_path / "missing", "-o", out)
+    assert "--steps and --minutes" in refused(capsys, walk, "-o", out, "--steps", "9", "--minutes", "2")
+    assert "--steps 0" in refused(capsys, walk, "-o", out, "--steps", "0")
+    assert "minutes=-1" in refused(capsys, walk, "-o", out, "--minutes", "-1")
+    assert "only the recipe `held`" in refused(capsys, walk, "-o", out, "--minutes", "1", "--recipe", "tracks")
     assert "--rounds 0" in refused(capsys, walk, "-o", out, "--rounds", "0")
     assert "held back" in refused(capsys, walk, "-o", out, "--evaluate", walk)
     assert "did you mean" in refused(capsys, walk, "-o", out, "--set", "held_back.shar=0.2")

@@ -63,20 +63,20 @@ def test_torch_computes_the_same_with_the_dead_channels_in_place() -> None:
 
 def test_training_keeps_dead_channels_out_and_saves_the_published_widths(tmp_path: Path, monkeypatch) -> None:
     torch = pytest.importorskip("torch")
-    from improvo.training import stages
+    from improvo.training.networks import ARCHITECTURES, first_network
     from improvo.training.settings import HomographiesSettings
 
     full = Architecture("full", encoder=(8, 8, 8, 8, 8, 8, 8, 8), head=8, descriptor=8)
-    monkeypatch.setitem(stages.ARCHITECTURES, "full", full)
+    monkeypatch.setitem(ARCHITECTURES, "full", full)
     asked = HomographiesSettings(architecture="full", stem_channels=4)
-    network, _ = stages._network(asked.architecture, 0, None, asked.stem_channels)
+    network, _ = first_network(asked.architecture, 0, None, asked.stem_channels)
     assert network.architecture.encoder == (4, 4, 4, 4, 8, 8, 8, 8)
     tensors = {name: values.numpy() for name, values in network.state_dict().items()}
     published = dataclasses.replace(full, stability=False)
     path = tmp_path / "full.safetensors"
     save_weights(path, with_dead_channels(tensors, published), ModelCard(published, "none"))
     assert load_weights(path).architecture.encoder == full.encoder
-    again, parent = stages._network("full", 0, path)
+    again, parent = first_network("full", 0, path)
     assert parent == path.name
     assert again.architecture.encoder == network.architecture.encoder
     for name, values in network.state_dict().items():

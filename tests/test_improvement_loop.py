@@ -25,7 +25,7 @@ from improvo.frontend.weights import load_weights
 from improvo.improvement.improve import Improvement
 from improvo.improvement.progress import ImprovementProgress
 from improvo.improvement.settings import ImproveSettings, ValidationSettings
-from improvo.improvement.validation import Validation, gain_interval, is_better, read_validation, rule
+from improvo.improvement.validation import GapScores, Validation, gain, is_better, read_validation, rule
 from improvo.labeling.labeled import read_labels
 
 EXAMPLE = Path(__file__).with_name("improvement_example.py")
@@ -74,6 +74,9 @@ def test_training_never_sees_what_is_held_back(finished: tuple[Improvement, Fake
         (labelled,) = read_labels(store)
         assert labelled.frames.source_index.tolist() == list(range(28))
         assert labelled.settings.end == 28
+        (seen,) = call["seen"]  # with depth, which was made from frames of this part alone
+        assert len(seen) >= 20
+        assert max(seen) < 28
     for candidate in result.candidates[:2]:  # the last is too bad to track anything
         (judged,) = read_labels(candidate.held_back)
         assert judged.frames.source_index.tolist() == list(range(28, 40))
@@ -83,7 +86,7 @@ def test_the_best_weights_are_kept_and_the_report_is_there(
     finished: tuple[Improvement, FakeTraining, list[str]],
 ) -> None:
     result, training, lines = finished
-    scores = [validation.score for validation in result.validations]
+    scores = [validation.mean("right_8px") for validation in result.validations]
     assert scores[2] < scores[0] < scores[1]
     assert result.best == 1
     kept, chosen = load_weights(result.weights), load_weights(result.candidates[1].weights)
@@ -122,16 +125,16 @@ def test_a_finished_run_is_left_as_it_is_and_more_rounds_go_on_from_it(
     assert run(out, [walk], again, rounds=1).best == result.best  # fewer rounds do not undo the others
     assert again.calls == []
     changed = {path.name for path, when in before.items() if path.stat().st_mtime_ns != when}
-    assert changed <= {".improvo.json", "report.html"}
+    assert changed <= {".improvo.json", ".improvo.lock", "report.html"}
 
 
 def test_other_settings_are_refused_and_what_a_kill_left_is_cleared_away(
     walk: Path, finished: tuple[Improvement, FakeTraining, list[str]], tmp_path: Path
 ) -> None:
     out = finished[0].weights.parent
-    training = replace(SETTINGS.training, descriptor_weight=2.0)
-    with pytest.raises(ConfigError, match=r"begun with training.descriptor_weight=1.0, now 2.0"):
-        run(out, [walk], FakeTraining(), settings=replace(SETTINGS, training=training))
+    training = replace(SETTINGS.held, descriptor_weight=2.0)
+    with pytest.raises(ConfigError, match=r"begun with held.descriptor_weight=1.0, now 2.0"):
+        run(out, [walk], FakeTraining(), settings=replace(SETTINGS, held=training))
     with pytest.raises(ConfigError, match="frontend"):
         run(out, [walk], FakeTraining(), settings=starting("superpoint"))
     with pytest.raises(ConfigError, match="sequences"):
@@ -143,25 +146,41 @@ def test_other_settings_are_refused_and_what_a_kill_left_is_cleared_away(
     leftovers[0].parent.mkdir()
     for leftover in leftovers:
         leftover.touch()
-    free = replace(SETTINGS.training, optimiser=replace(SETTINGS.training.optimiser, threads=1, log_every=3))
-    run(out, [walk], FakeTraining(), settings=replace(SETTINGS, training=free))
+    free = replace(SETTINGS.held, optimiser=replace(SETTINGS.held.optimiser, threads=1, log_every=3))
+    run(out, [walk], FakeTraining(), settings=replace(SETTINGS, held=free))
     assert not any(leftover.exists() for leftover in leftovers)
 
 
-def test_a_folder_of_a_former_version_goes_on(
-    walk: Path, finished: tuple[Improvement, FakeTraining, list[str]]
+def test_a_folder_of_a_former_version_is_refused_for_what_it_is(
+    walk: Path, finished: tuple[Improvement, FakeTraining, list[str]], tmp_path: Path
 ) -> None:
-    path = finished[0].weights.parent / "settings.yaml"
+    shutil.copytree(finished[0].weights.parent, tmp_path / "out")
+    path = tmp_path / "out" / "settings.yaml"
     values = yaml.safe_load(path.read_text())
-    values["judge"], values["held_back"] = values.pop("validation"), values.pop("split")
-    values["labels"]["second_opinion"] = values["labels"].pop("quality")
-    for name in ("device", "threads", "workers", "checkpoint_minutes", "log_every"):
-        del values["training"]["optimiser"][name]
+    del values["reference"], values["recipe"]
     path.write_text(yaml.safe_dump(values))
-    training = FakeTraining()
-    assert run(path.parent, [walk], training).best == finished[0].best
-    assert training.calls == []
-    assert yaml.safe_load(path.read_text())["split"] == {"share": 0.3}
+    with pytest.raises(ConfigError, match="an earlier version, which measured otherwise"):
+        run(path.parent, [walk], FakeTraining())
+
+
+def test_the_control_is_judged_like_a_round_and_never_kept(walk: Path, tmp_path: Path) -> None:
+    training, lines = FakeTraining((0.0,)), list[str]()
+    out = tmp_path / "out"
+    settings = replace(SETTINGS, control=True)
+    result = run(out, [walk], training, rounds=1, settings=settings, progress=ImprovementProgress(lines.append))
+    assert [call["control"] for call in training.calls] == [False, True]
+    assert training.calls[0]["seen"] == training.calls[1]["seen"]
+    assert [call["steps"] for call in training.calls] == [0, 3]  # as many as the round took
+    assert result.control is not None
+    control, validation = result.control
+    assert control.weights == out / "control" / "weights.safetensors"
+    assert [scores.pairs for scores in validation.scores] == [scores.pairs for scores in result.validations[0].scores]
+    assert result.candidates[result.best].name == "round 1"
+    assert any(line.startswith("control: ") and not line.endswith("kept") for line in lines)
+    assert "The control, trained for as many steps" in (out / "report.html").read_text()
+    again = FakeTraining()
+    assert run(out, [walk], again, rounds=1, settings=SETTINGS).control is None  # it may be left out or added
+    assert again.calls == []
 
 
 def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(walk: Path, tmp_path: Path) -> None:
@@ -193,8 +212,10 @@ def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(wa
     assert [found.name for found in read_labels(result.candidates[0].held_back)] == ["hall"]
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Left out: black: " in page
-    assert sum("room: " in line and "with a pose" in line for line in lines) == 2  # once in the survey, once by a link
-    assert not (tmp_path / "out" / "survey").exists()
+    # once in the survey, which is the reference too, and once by a link in the labels of the training part
+    assert sum("room: " in line and "with a pose" in line for line in lines) == 2
+    assert (tmp_path / "out" / "reference" / "hall" / "depth-held-back.zip").is_file()
+    assert not (tmp_path / "out" / "reference" / "hall" / "depth-training.zip").exists()
     with pytest.raises(InputError, match="nothing could be labelled"):
         run(tmp_path / "nothing", [black, short], FakeTraining())
     few = replace(SETTINGS, sequence=replace(SETTINGS.sequence, end=5))
@@ -247,9 +268,9 @@ def test_a_run_that_ends_after_each_of_its_steps_goes_on(
         step = getattr(Rounds, name)
 
         def stopping(rounds: Rounds, *arguments: object) -> object:
-            there = name != "label" and arguments[0].validation.is_file()  # type: ignore[attr-defined]
+            there = name in ("train", "validate") and arguments[0].validation.is_file()  # type: ignore[attr-defined]
             done = step(rounds, *arguments)
-            key = f"{name} {len(training.calls)} {arguments[0]}"
+            key = name if name == "reference" else f"{name} {len(training.calls)} {arguments[0]}"
             if key not in made and not there:
                 made.append(key)
                 raise StoppedError
@@ -257,7 +278,7 @@ def test_a_run_that_ends_after_each_of_its_steps_goes_on(
 
         monkeypatch.setattr(Rounds, name, stopping)
 
-    for name in ("label", "train", "validate"):
+    for name in ("reference", "label", "train", "validate"):
         stop_after(name)
     training = FakeTraining()
     stops = 0
@@ -267,7 +288,7 @@ def test_a_run_that_ends_after_each_of_its_steps_goes_on(
             break
         except StoppedError:
             stops += 1
-    assert stops == len(made) >= 7  # three validations, two rounds of labelling and learning
+    assert stops == len(made) >= 8  # the reference, three validations, two rounds of labelling and learning
     assert len(training.calls) == 2
     assert results(tmp_path / "out") == results(finished[0].weights.parent)
 
@@ -319,31 +340,39 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on_later(
     assert results(out) == results(finished[0].weights.parent)
 
 
-def validation(agreeing: list[int], tracked: int = 100) -> Validation:
-    return Validation(100, tracked, 8.0, 0.8, 0.5, {}, {"30": agreeing}, {"30": 0.1})
+def validation(right: list[float], tracked: int = 100, segments: int = 1) -> Validation:
+    values = {"right_3px": [value / 2 for value in right], "right_8px": right}
+    pairs = [[row, row + 30] for row in range(len(right))]
+    scores = GapScores("room", 0, 30, 1.0, pairs, [100] * len(right), values)
+    return Validation(100, tracked, segments, 8.0, 0.8, 0.5, {}, (scores,))
 
 
-def test_better_is_more_matches_without_losing_frames() -> None:
+def test_better_is_more_right_matches_with_odometry_that_is_no_worse() -> None:
     settings = ValidationSettings()
-    start = validation([40, 50, 60] * 5)
-    assert is_better(validation([42, 51, 62] * 5), start, settings)
-    assert not is_better(validation([40, 50, 60] * 5), start, settings)
-    assert not is_better(validation([60, 40, 52] * 5), start, settings)  # more, by chance
-    assert is_better(validation([80, 90, 99] * 5, tracked=99), start, settings)
-    assert not is_better(validation([80, 90, 99] * 5, tracked=98), start, settings)
-    assert is_better(validation([80, 90, 99] * 5, tracked=98), start, replace(settings, frames_lost=0.05))
+    start = validation([0.4, 0.5, 0.6] * 5)
+    assert is_better(validation([0.42, 0.51, 0.62] * 5), start, settings)
+    assert not is_better(validation([0.4, 0.5, 0.6] * 5), start, settings)
+    assert not is_better(validation([0.6, 0.4, 0.52] * 5), start, settings)  # more, by chance
+    more = [0.7, 0.8, 0.9] * 5
+    assert is_better(validation(more, tracked=99), start, settings)
+    assert not is_better(validation(more, tracked=98), start, settings)
+    assert is_better(validation(more, tracked=98), start, replace(settings, frames_lost=0.05))
+    assert not is_better(validation(more, segments=2), start, settings)
+    assert is_better(validation(more, segments=2), start, replace(settings, segments_more=1))
 
 
 def test_the_interval_of_a_gain_is_over_pairs() -> None:
-    rng = np.random.default_rng(1)
-    before = rng.integers(20, 80, 50)
-    low, high = gain_interval(validation((before + 5).tolist()), validation(before.tolist()))
-    assert low == pytest.approx(5)
-    assert high == pytest.approx(5)
-    after = before + rng.normal(0, 20, 50).round().astype(int)
-    low, high = gain_interval(validation(after.tolist()), validation(before.tolist()))
-    assert low < 0 < high
-    assert high - low < 20
+    rng, judge = np.random.default_rng(1), ValidationSettings().matches
+    before = rng.uniform(0.2, 0.8, 50)
+    found = gain(validation((before + 0.05).tolist()), validation(before.tolist()), "right_8px", judge)
+    assert found.low == pytest.approx(0.05)
+    assert found.high == pytest.approx(0.05)
+    assert found.words.startswith(f"{5 / before.mean():+.1f} %, 95 % interval ")
+    after = before + rng.normal(0, 0.2, 50)
+    found = gain(validation(after.tolist()), validation(before.tolist()), "right_8px", judge)
+    assert found.low < 0 < found.high
+    assert found.high - found.low < 0.2
+    assert gain(validation([0.1]), validation([0.0]), "right_8px", judge).words.startswith("+0.100")
 
 
 def test_a_damaged_judgement_is_named(tmp_path: Path) -> None:

@@ -145,7 +145,7 @@ def test_a_camera_that_turned_gives_exact_homographies(tmp_path: Path) -> None:
     for index in range(2):
         cv2.imwrite(str(folder / f"{index}.png"), np.full((48, 64), 90, np.uint8))
     (folder / "camera.yaml").write_text(
-        "width: 64\nheight: 48\nfx: 50\nfy: 50\ncx: 31.5\ncy: 23.5\ndistortion: [0, 0]\n"
+        "width: 64\nheight: 48\nfx: 50\nfy: 50\ncx: 31.5\ncy: 23.5\ndistortion: [0, 0, 0, 0]\n"
     )
     half = np.radians(10) / 2  # the second camera looks 10 degrees to the right: what was ahead moves left
     (folder / "groundtruth.txt").write_text(f"0 0 0 0 0 0 0 1\n1 0 0 0 0 {np.sin(half)} 0 {np.cos(half)}\n")

@@ -17,10 +17,14 @@ torch = pytest.importorskip("torch", reason="training needs the extra `train`")
 from posed_room import SIZE, posed_room  # noqa: E402
 
 from improvo.errors import ConfigError, InputError  # noqa: E402
+from improvo.frontend.architecture import ARCHITECTURES  # noqa: E402
+from improvo.frontend.superpoint import SuperPoint  # noqa: E402
 from improvo.frontend.weights import DataSource, find_weights, load_weights  # noqa: E402
 from improvo.training.device_pairs import DevicePairs  # noqa: E402
+from improvo.training.held import HeldStage  # noqa: E402
 from improvo.training.held_training import train_held  # noqa: E402
 from improvo.training.losses import held_loss, info_nce_loss  # noqa: E402
+from improvo.training.mixed_pairs import MixedPairs  # noqa: E402
 from improvo.training.pack import read_pack, write_pack  # noqa: E402
 from improvo.training.photometric_batch import augment_batch  # noqa: E402
 from improvo.training.picture_store import DepthStore, PictureStore  # noqa: E402
@@ -316,3 +320,32 @@ def test_a_pack_gives_back_what_was_packed(tmp_path: Path) -> None:
 def test_settings_out_of_range_are_refused(make: Any) -> None:
     with pytest.raises(ConfigError):
         make()
+
+
+class Tracks:
+    """Stands for `TrackedPairs`."""
+
+    def __getitem__(self, step: int) -> dict[str, Any]:
+        images = np.full((4, 1, 96, 128), step, np.uint8)
+        points, known = np.ones((2, 64, 2), np.float32), np.ones((2, 64), np.bool_)
+        return {"images": images, "points_a": points, "points_b": points, "valid": known, "negative": known, "cells": 0}
+
+
+def test_tracks_take_turns_with_dense_pairs_and_are_held_to_the_same_teachers() -> None:
+    settings = replace(SMALL, stability_every=2)
+
+    def calm(views: Any) -> Any:
+        return torch.zeros(len(views), 2, 12, 16)
+
+    dense = DevicePairs(Pictures(()), [posed_room()], settings, no_keypoints, calm, CPU)
+    mixed = MixedPairs(dense, Tracks())  # type: ignore[arg-type]
+    assert len(mixed) == len(dense) == 12
+    even, odd = mixed[2], mixed[3]
+    assert torch.equal(even["images"], dense[2]["images"])
+    assert even.keys() | {"negative"} == odd.keys()
+    assert (odd["images"] == 3).all()
+    assert odd["detector"].shape == (4, 65, 12, 16)
+    assert odd["stability"].shape == (2, 2, 12, 16)
+    network = HeldStage(SuperPoint(replace(ARCHITECTURES["superpoint-small"], stability=True)), settings)
+    batch = {**odd, "images": odd["images"].float() / 255}
+    assert torch.isfinite(network.losses(batch)["loss"])

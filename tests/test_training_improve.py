@@ -20,25 +20,12 @@ from improvo.frontend.weights import load_weights, save_weights
 
 COMMAND = [
     *("--frontend", "superpoint-small", "--max-keypoints", "250", "--steps", "6", "--batch-size", "2"),
-    *(
-        "--set",
-        "labels.min_observations=6",
-        "--set",
-        "validation.survival.gaps=[4,8]",
-        "--set",
-        "validation.survival.pairs=4",
-    ),
-    *(
-        "--set",
-        "validation.survival.min_pairs=2",
-        "--set",
-        "split.share=0.3",
-        "--set",
-        "validation.calibration_images=2",
-    ),
+    *("--set", "labels.min_observations=6", "--set", "validation.gaps=[4,8]", "--set", "validation.matches.pairs=4"),
+    *("--set", "validation.min_pairs=2", "--set", "split.share=0.3", "--set", "validation.calibration_images=2"),
+    *("--set", "held.views.height=120", "--set", "held.views.width=160", "--control"),
     *("--set", "odometry.start.max_homography_ratio=0.9"),  # the room is mostly one wall
-    *("--set", "training.optimiser.checkpoint_minutes=0", "--set", "training.optimiser.log_every=1"),
-    *("--set", "training.optimiser.workers=0", "--threads", "1"),
+    *("--set", "held.optimiser.checkpoint_minutes=0", "--set", "held.optimiser.log_every=1"),
+    *("--threads", "1"),
 ]
 
 
@@ -62,17 +49,19 @@ def test_a_round_is_the_same_after_a_kill(tmp_path: Path) -> None:
     assert start(killed).wait() == 0
 
     trained = load_weights(calm / "round-1" / "weights.safetensors")
-    assert trained.architecture.stability
+    assert trained.architecture.stability == load_weights(calm / "start" / "weights.safetensors").architecture.stability
     assert trained.card.activation_ranges
     start_weights = load_weights(calm / "start" / "weights.safetensors")
     assert any(not np.array_equal(trained.tensors[name], start_weights.tensors[name]) for name in start_weights.tensors)
-    for name in ("round-1/weights.safetensors", "weights.safetensors"):
+    for name in ("round-1/weights.safetensors", "control/weights.safetensors", "weights.safetensors"):
         ours, theirs = load_weights(killed / name), load_weights(calm / name)
         assert ours.tensors.keys() == theirs.tensors.keys()
         for key, tensor in ours.tensors.items():
             np.testing.assert_array_equal(tensor, theirs.tensors[key])
-    for name in ("points.parquet", "tracks.parquet"):
-        path = Path("start", "labels", "room", name)
+    for path in (
+        *(Path("start", "labels", "room", name) for name in ("points.parquet", "tracks.parquet")),
+        *(Path("reference", "room", f"depth-{part}.zip") for part in ("training", "held-back")),
+    ):
         assert (killed / path).read_bytes() == (calm / path).read_bytes()
     assert not list(killed.rglob("*.partial*"))
     assert load_network_frontend(calm / "round-1" / "weights.safetensors").runtime.name == "openvino-int8"

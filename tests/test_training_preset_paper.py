@@ -61,6 +61,9 @@ class GreyFrames:
     def picture(self, frame: int) -> np.ndarray:
         return np.full((72, 96), frame, np.uint8)
 
+    def mask(self, frame: int) -> None:
+        return None
+
     def useful_frames(self, least: int) -> np.ndarray:
         return np.arange(self.count) if least <= 20 else np.zeros(0, np.int64)
 

@@ -2,9 +2,9 @@
 
 
 class ImprovoError(Exception):
-    """Something a user can mend.
+    """Something a user can correct.
 
-    The message is one line that names the file or setting, says what is wrong with it, and how to mend it.
+    The message is one line that names the file or setting, says what is wrong with it, and how to correct it.
     The command line prints it and exits with status 2.
     """
 

@@ -104,7 +104,7 @@ def _paper_improve() -> ImproveSettings:
 
     paper, usual = _paper_run(), ImproveSettings()
     training = replace(_paper_training(), optimiser=usual.training.optimiser)
-    return replace(usual, odometry=paper.odometry, labels=paper.labels, training=training)
+    return replace(usual, odometry=paper.odometry, labels=paper.labels, recipe="tracks", training=training)
 
 
 def _paper_pose() -> PoseCommandSettings:

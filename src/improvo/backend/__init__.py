@@ -1,6 +1,7 @@
-"""Bundle adjustment: the paper's objective and its solver.
+"""Bundle adjustment: the paper's objective and the solver that minimises it. It takes and returns plain arrays.
 
-Light to import; the compiled kernels load with the first use of `solve`.
+It imports `geometry`. Open `objective.py` first: the equation, in NumPy. `solver.py` is the fast solver of the same
+objective; its compiled kernels load with the first call of `solve`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The problem as the kernels want it: observations sorted by point, free cameras numbered, memory laid out once."""
+"""Prepares a problem for the kernels: sorts observations by point, numbers free cameras, allocates memory once."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Compiling the kernels of the backend ahead of time, so that a progress line can say so.
+"""Compiles the kernels of the backend ahead of time, so that a command can announce it.
 
 Numba compiles a kernel when it is first called and caches the machine code beside the source (or in the user's cache
-folder, or where NUMBA_CACHE_DIR says), so this takes seconds once per installation and a fraction of one afterwards.
+folder, or where NUMBA_CACHE_DIR says), so this takes some seconds once per installation, and a fraction of a second
+afterwards.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One observation at a time: where the point is in the camera, what is wrong there, and how strongly that pulls.
+"""The derivatives of one observation at a time: point in the camera, residuals, gradient and Hessian.
 
 With x = R X + t, an observation is, to second order, a gradient (3,) and a Hessian A (3, 3) in the camera's own frame;
 everything else follows from how x moves:

@@ -1,4 +1,4 @@
-"""The objective of the paper, written to be read: the reference that the compiled solver is tested against.
+"""The objective of the paper, written for readers. The compiled solver is tested against it.
 
     Omega = sum_ij w_ij rho(e_ij^2 + d(Z_ij))                                     (paper, eq. ba-obj)
 
@@ -8,10 +8,10 @@ e_ij^2 + d(Z_ij) is the squared norm of one residual vector per observation, in 
     max(0, Z - depth_max)             eq. depth_regularization, times sqrt(depth_weight)
     min(0, Z - depth_min)
 
-so that rho, the Huber loss of that squared norm, is what Ceres calls HuberLoss, and w_ij its ScaledLoss (Ceres reports
-half of the sum). A point behind the camera keeps its mirrored projection, as the equations have it: only the depth
-term speaks against it, so callers drop what ends up there. Within MIN_DEPTH of the plane of the camera, where the
-projection has no value, it is that of the nearest plane on the same side.
+rho is the Huber loss of that squared norm: Ceres calls it HuberLoss, and w_ij ScaledLoss (Ceres reports half of the
+sum). A point behind the camera keeps its mirrored projection, as in the paper's equations. Only the depth term
+penalises it, so callers drop points that end up there. The projection is undefined in the plane of the camera; within
+MIN_DEPTH of that plane, the depth is replaced by MIN_DEPTH on the same side.
 """
 
 from __future__ import annotations

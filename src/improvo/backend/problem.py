@@ -1,4 +1,4 @@
-"""What the solver takes and what it gives: plain arrays, checked once."""
+"""Input and output of the solver: plain arrays, checked once."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class BundleProblem:
 
 @dataclass(frozen=True)
 class BundleResult:
-    """The optimum that was reached, with what a caller needs to judge it."""
+    """The solution, with the figures that a caller needs to judge it."""
 
     cam_from_world: Float64  # (N, 4, 4)
     points: Float64  # (M, 3)

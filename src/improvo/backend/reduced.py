@@ -1,7 +1,7 @@
 """The reduced system of the cameras: a dense Cholesky factorisation in place, six rows (one camera) at a time.
 
-Our own, because the result must not depend on how many threads a BLAS happens to use, and because at the size of a
-window (180 unknowns) it takes no longer than LAPACK does.
+It is our own code because the result must not depend on the number of BLAS threads. At the size of a window (180
+unknowns) it is as fast as LAPACK.
 """
 # mypy: disable-error-code="no-untyped-def,no-untyped-call"
 

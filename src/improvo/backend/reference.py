@@ -1,4 +1,7 @@
-"""A slow solver written to be read: dense normal equations, numeric derivatives, NumPy only. The tests' oracle."""
+"""A slow, plain solver that the tests compare the fast one with: dense normal equations, numeric derivatives, NumPy.
+
+The equation of the objective is not here but in `objective.py`.
+"""
 
 from __future__ import annotations
 

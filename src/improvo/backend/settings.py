@@ -35,11 +35,11 @@ class SolverSettings:
 
     max_iterations: int = 100  # steps tried, accepted or not (paper, "VO Backend Implementation")
     relative_decrease: float = 1e-4  # stop when a step changes the cost by less than this share
-    initial_damping: float = 1e-4  # of the diagonal of the normal equations, before the first step
-    min_damping: float = 1e-12  # keeps points seen once, and a free gauge, well defined
+    initial_damping: float = 1e-4  # share of the diagonal of the normal equations, before the first step
+    min_damping: float = 1e-12  # keeps the system well defined with points seen once and with a free gauge
     max_damping: float = 1e12  # stop when no step this short lowers the cost
-    min_diagonal: float = 1e-6  # least diagonal entry that damping is a share of
-    min_gain: float = 1e-3  # accept a step that brings at least this share of the decrease that it promised
+    min_diagonal: float = 1e-6  # smaller diagonal entries count as this in the damping
+    min_gain: float = 1e-3  # accept a step that gives at least this share of the predicted decrease
 
     def __post_init__(self) -> None:
         if self.max_iterations < 0:

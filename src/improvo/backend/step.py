@@ -1,4 +1,4 @@
-"""Taking a step: the left perturbation of the poses, and what the linear model promises of it."""
+"""Taking a step: the left perturbation of the poses, and the decrease that the linear model predicts."""
 # mypy: disable-error-code="no-untyped-def,no-untyped-call"
 
 from __future__ import annotations

@@ -14,10 +14,10 @@ from improvo.cli.flags import add_setting
 from improvo.cli.label import add_job_arguments
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, check_recordings, settings_from
 from improvo.cli.output import figures, next_step, notice, say
-from improvo.cli.train_options import add_data_card, add_optimiser_arguments, read_data_card
+from improvo.cli.train_options import add_data_card, read_data_card
 from improvo.errors import ConfigError
 from improvo.files import check_output_folder
-from improvo.improvement.settings import ImproveSettings
+from improvo.improvement.settings import RECIPES, ImproveSettings
 from improvo.verbs import need_torch
 
 
@@ -51,29 +51,54 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_setting(parser, defaults, "--max-keypoints", "frontend.max_keypoints")
     add_setting(parser, defaults, "--seed", "odometry.seed", help="of all random choices")
-    add_optimiser_arguments(parser.add_argument_group("training, in each round"), defaults, "training.optimiser")
+    group = parser.add_argument_group("training, in each round")
+    add_setting(group, defaults, "--recipe", "recipe", choices=RECIPES)
+    add_setting(group, defaults, "--minutes", "minutes")
+    add_setting(group, defaults, "--control", "control")
+    for flag, text in (
+        ("--steps", "of training (default: 3 for each frame, 300 to 1200 in all; 1000 with the recipe tracks)"),
+        ("--batch-size", "pairs of images a step (default: 2; 8 smaller ones with the recipe tracks)"),
+    ):
+        group.add_argument(flag, type=int, default=argparse.SUPPRESS, metavar="N", help=text)
+    add_setting(group, defaults, "--device", "held.optimiser.device", help="to train on: cpu, cuda or auto")
+    add_setting(group, defaults, "--threads", "held.optimiser.threads", metavar="N")
     add_sequence_arguments(parser)
     add_config_arguments(parser)
+
+
+def _of_both_recipes(arguments: argparse.Namespace) -> list[str]:
+    """Settings of the optimiser that a flag gives to either recipe."""
+    extra = []
+    for name in ("steps", "seed", "batch_size", "device", "threads"):
+        if hasattr(arguments, name):
+            extra += [f"{recipe}.optimiser.{name}={getattr(arguments, name)}" for recipe in ("held", "training")]
+    if hasattr(arguments, "steps"):
+        extra.append("steps_per_frame=0")
+        extra += [f"{recipe}.optimiser.decay_steps={arguments.steps // 3}" for recipe in ("held", "training")]
+        if arguments.steps < 1:
+            raise ConfigError(f"--steps {arguments.steps}: must be at least 1")
+        if getattr(arguments, "minutes", 0):
+            raise ConfigError("--steps and --minutes: give one of them")
+    return extra
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Improve; 0 also where no round was better than the start, which is said."""
     if arguments.rounds < 1:
         raise ConfigError(f"--rounds {arguments.rounds}: must be at least 1")
-    extra = [f"training.optimiser.decay_steps={arguments.steps // 3}"] if hasattr(arguments, "steps") else []
-    if hasattr(arguments, "seed"):
-        extra.append(f"training.optimiser.seed={arguments.seed}")
-    settings = settings_from(ImproveSettings, arguments, extra=extra)
+    settings = settings_from(ImproveSettings, arguments, extra=_of_both_recipes(arguments))
     check_output_folder(arguments.output, "improve")
     check_recordings(arguments.sequences)
     data = read_data_card(arguments.data_card)
     need_torch()
 
+    from improvo.depth.compile import compile_depth
     from improvo.improvement.improve import improve
     from improvo.improvement.progress import ImprovementProgress, gain_words
     from improvo.odometry.compile import compile_odometry
 
     compile_odometry(notice)
+    compile_depth(notice)
     result = improve(
         arguments.sequences,
         arguments.output,
@@ -88,10 +113,13 @@ def run(arguments: argparse.Namespace) -> int:
     kept = result.candidates[result.best].name
     figures({"weights": str(result.weights), "best": result.best, "kept": kept}, "")
     if result.best:
-        gain = gain_words(result.validations[result.best], result.validations[0])
-        say(f"kept: {kept}, {gain} matches that survive")
+        gain = gain_words(result.validations[result.best], result.validations[0], settings.validation)
+        say(f"kept: {kept}, right matches {gain}")
     else:
         say("no round was better than the start; its weights are kept")
+    if result.control:
+        gain = gain_words(result.control[1], result.validations[0], settings.validation)
+        say(f"control, by homographies alone: right matches {gain}")
     say(f"weights in {result.weights}")
     say(f"report in {arguments.output / 'report.html'}")
     next_step(f"`improvo run SEQUENCE --frontend {result.weights} -o out` uses them")

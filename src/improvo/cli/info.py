@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ from improvo.cli.flags import add_setting
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
 from improvo.cli.output import figures, next_step, say
 from improvo.sequences.settings import InfoSettings
+
+_CAMERA = ("format", "camera", "fov", "topic")  # options that a run of the same recording needs too
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,7 +42,8 @@ def run(arguments: argparse.Namespace) -> None:
     if not findings["problems"]:
         lines.append("nothing wrong was found")
     figures(findings, "\n".join(lines))
-    options = "" if findings["camera"] else " --camera FILE"
+    given = [f" --{name} {shlex.quote(str(vars(arguments)[name]))}" for name in _CAMERA if vars(arguments).get(name)]
+    options = "".join(given) if findings["camera"] else " --camera FILE"
     if arguments.write_mask is not None:
         say(_write_mask(arguments, settings))
         options += f" --mask {arguments.write_mask}"

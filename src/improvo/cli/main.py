@@ -8,6 +8,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from improvo import __version__
 from improvo.cli import output
@@ -17,7 +18,7 @@ from improvo.jobs.interrupts import termination_interrupts
 
 _EPILOG = """\
 `improvo VERB --help` shows a command's options with their defaults.
-Exit status: 0 done, 2 an error that you can mend (one line says how), 130 interrupted, 1 a bug of improvo."""
+Exit status: 0 done, 2 an error that you can correct (one line says how), 130 interrupted, 1 a bug of improvo."""
 
 
 class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
@@ -29,12 +30,20 @@ class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
         return super()._get_help_string(action)
 
 
+class _Parser(argparse.ArgumentParser):
+    """Errors are one line, without the usage, which is long for commands with many options."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the error and exit with status 2."""
+        self.exit(2, f"{self.prog}: {message}; `{self.prog} --help` shows the options\n")
+
+
 class _Text(HelpFormatter, argparse.RawDescriptionHelpFormatter):
     """Keeps the line breaks of descriptions."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point. Returns the exit status: 0 done, 2 an error that the user can mend, 130 interrupted."""
+    """Entry point. Returns the exit status: 0 done, 2 an error that the user can correct, 130 interrupted."""
     words = list(sys.argv[1:] if argv is None else argv)
     os.environ.setdefault("MPLCONFIGDIR", str(cache_folder() / "matplotlib"))  # made by matplotlib, if it is used
     try:
@@ -78,7 +87,7 @@ def cache_folder() -> Path:
 
 def parser_for(words: Sequence[str]) -> argparse.ArgumentParser:
     """The parser of all commands; only the module of the one that `words` name is imported."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="improvo",
         description="Self-improving visual odometry: video in; a trajectory, a map and a better frontend out.",
         epilog=_EPILOG,
@@ -91,9 +100,7 @@ def parser_for(words: Sequence[str]) -> argparse.ArgumentParser:
     return parser
 
 
-def _add_commands(
-    parsers: argparse._SubParsersAction[argparse.ArgumentParser], commands: dict[str, Command], named: list[str]
-) -> None:
+def _add_commands(parsers: argparse._SubParsersAction[_Parser], commands: dict[str, Command], named: list[str]) -> None:
     for name, command in commands.items():
         chosen = named[:1] == [name]
         leaf = chosen and not command.parts

@@ -66,7 +66,7 @@ def _settings(arguments: argparse.Namespace) -> SimulationSettings:
     changes: dict[str, Any] = {}
     if hasattr(arguments, "size"):
         width, _, height = arguments.size.partition("x")
-        if not (width.isdigit() and height.isdigit()):
+        if not all(side.isdecimal() and len(side) < 9 for side in (width, height)):
             raise ConfigError(f"--size {arguments.size}: write it as WIDTHxHEIGHT, such as 640x480")
         changes |= {"width": int(width), "height": int(height)}
     if arguments.grey:

@@ -75,7 +75,7 @@ def write_dense(
             for frame, depth_map in depth_maps(
                 pictures.grey, cam_from_world, trajectory.segment, camera.K, lambda row: _triple(ranges[row]), settings
             ):
-                depth_map = _without_masked(depth_map, pictures.mask(frame))
+                depth_map = without_masked(depth_map, pictures.mask(frame))
                 writer.write(frame, depth_map.depth)
                 cloud.add(depth_map, pictures.colour(frame), trajectory.world_from_cam[frame])
                 frames, pixels = frames + 1, pixels + depth_map.depth.size
@@ -105,7 +105,7 @@ def _triple(values: Float64) -> tuple[float, float, float]:
     return near, median, far
 
 
-def _without_masked(depth_map: DepthMap, mask: Mask | None) -> DepthMap:
+def without_masked(depth_map: DepthMap, mask: Mask | None) -> DepthMap:
     """The map without what any masked pixel (H, W) of the frame has a part in."""
     if mask is None:
         return depth_map

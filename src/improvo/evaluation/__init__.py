@@ -1,5 +1,6 @@
-"""How good frontends, odometry and labels are: a folder for each protocol, and what they share.
+"""How good frontends, odometry and labels are: one folder for each protocol, and what the protocols share.
 
-`settings` has every protocol's settings, `sources` the frames and features, `measures` what one image pair says,
-`statistics` the curves and intervals, and `truth` the reference poses.
+It imports `training`, `odometry`, `stability`, `sequences`, `frontend`, `tracking`, `geometry` and `jobs`. Open
+`pose/protocol.py` first (the paper's Table 1), then `trajectory/protocol.py` and `vo/protocol.py` (Table 2). `truth`
+makes reference poses; `frontends` wraps other people's networks to compare with (ours are in `improvo.frontend`).
 """

@@ -97,28 +97,6 @@ class HomographySettings:
 
 
 @dataclass(frozen=True)
-class SurvivalSettings:
-    """Matches that survive a wide baseline, counted without ground truth (docs/improvement.md)."""
-
-    gaps: tuple[int, ...] = (30, 60, 90)  # frames between the two images, as delivered (after any stride)
-    pairs: int = 50  # per sequence and gap, evenly spread
-    min_pairs: int = 10  # that the longest sequence must have for a gap to be used
-    max_keypoints: int = 500
-    max_epipolar_error: float = 1.5  # pixels; a match within it agrees with the pair's geometry
-    min_agreeing: int = 15  # fewer matches that agree count as none: those of unrelated pictures reach 14
-    max_iterations: int = 10_000  # of the robust solver
-    seed: int = 0  # of the robust solver and the intervals
-
-    def __post_init__(self) -> None:
-        if not self.gaps or min(self.gaps) < 1 or len(set(self.gaps)) < len(self.gaps):
-            raise ConfigError(f"gaps {list(self.gaps)}: give different numbers of frames, each 1 or more")
-        if min(self.pairs, self.min_pairs, self.max_iterations) < 1 or self.max_keypoints < 5:
-            raise ConfigError("pairs, min_pairs and max_iterations must be at least 1, max_keypoints at least 5")
-        if not self.max_epipolar_error > 0 or self.min_agreeing < 0:
-            raise ConfigError("max_epipolar_error must be positive pixels, min_agreeing 0 or more")
-
-
-@dataclass(frozen=True)
 class PoseCommandSettings:
     """Settings of `improvo evaluate pose`."""
 

@@ -1,4 +1,4 @@
-"""The part of a run that other tools want: one segment's poses, good points, and their observations."""
+"""The part of a run that is exported: the poses of one segment, its good points, and their observations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A network with its decoding as one ONNX file, for programs that have ONNX Runtime and nothing of improvo."""
+"""A network with its decoding as one ONNX file, for programs that use ONNX Runtime without improvo."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ _EUROC_HEADER = (
 
 
 def export_trajectory(trajectory: Trajectory, frames: int, path: Path, format: str) -> None:
-    """Write camera-to-world poses; lengths are in map units, whatever a header says.
+    """Write camera-to-world poses. Lengths are in map units, even where the format's header says metres.
 
     Args:
         trajectory: the frames with a pose.

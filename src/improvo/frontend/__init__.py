@@ -1,4 +1,8 @@
-"""Images in, `Features` out: classical detectors and the network, behind one interface."""
+"""Images in, `Features` (keypoints, descriptors, scores) out: classical detectors and the network.
+
+It imports no other room. The interface is the class `Frontend` below; then open `registry.py`, which finds a frontend
+by its name and where a new one is added. `classical.py` is the shortest example.
+"""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""What a network is made of, without torch: the widths, the order of normalisation, and the resulting layers.
+"""The architecture of a network, without torch: the widths, the order of normalisation, and the resulting layers.
 
 The paper fixes the architecture `superpoint` ("Convolutional Frontend"): a backbone of eight 3×3 convolutions,
 64-64-64-64-128-128-128-128, with a 2×2 max-pool after the second, fourth and sixth, and three heads of one 3×3
 convolution (256) and one 1×1: detector 65, descriptor 256, stability 2.
 
-`superpoint-small` halves every width. Its descriptors are 128-D: half of the matching and of the memory, and the head
-that makes them has only 128 channels to draw from.
+`superpoint-small` halves every width. Its descriptors are 128-D, which halves the cost of matching and the memory; the
+128 channels of its descriptor head would not support more.
 """
 
 from __future__ import annotations

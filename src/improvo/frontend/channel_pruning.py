@@ -1,9 +1,9 @@
-"""Channels that are always zero: left out where a network runs or is trained, put back where its weights are kept.
+"""Channels that are always zero: left out when a network runs or is trained, put back when its weights are saved.
 
 The first layers work on the most pixels: in `superpoint` the first four, 64 channels wide, take three fifths of all
-multiplications. Weights may leave some of those channels unused, their filters, biases and batch norm all zero.
-The file then still has the paper's shapes and computes what any other program makes of it; without them it computes the
-same in less time. Training keeps them at zero by itself: nothing passes a ReLU at zero in either direction.
+multiplications. Weights may leave some of those channels unused, their filters, biases and batch norm all zero. The
+file then still has the paper's shapes, and other programs can run it. Without these channels it computes the same in
+less time. Training keeps them at zero, because a ReLU at zero passes neither a value nor a gradient.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """SIFT, ORB, AKAZE and SURF behind the `Frontend` interface.
 
-The paper compares with "the default OpenCV implementation" of each; that is what `sensitive=False` gives. Odometry
-needs points on weakly textured walls and doors too, so `sensitive=True` lowers the detection threshold: the best
-`max_keypoints` are kept all the same, so that only images with too few points change.
+The paper compares with "the default OpenCV implementation" of each; `sensitive=False` is that. Odometry also needs
+keypoints on weakly textured walls and doors, so `sensitive=True` lowers the detection threshold. The best
+`max_keypoints` are kept in both cases, so only images with too few keypoints change.
 """
 
 from __future__ import annotations

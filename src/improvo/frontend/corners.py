@@ -1,8 +1,8 @@
-"""Keypoints moved to the corner that they stand for: the network says where to look, the image says where exactly.
+"""Keypoints of the network moved to the exact position of the corner in the image.
 
-A heat map of 8×8 cells is sharp to about a pixel after long training and to less after a short one; the image's own
-gradients are sharp to a fraction of that. Each keypoint goes to the largest smaller eigenvalue of the structure tensor
-(Shi and Tomasi, 1994) around it, weighted towards where the network put it, and to the peak of a parabola through it.
+A heat map of 8×8 cells is accurate to about a pixel after long training, and worse after a short one; image gradients
+are accurate to a fraction of a pixel. Each keypoint goes to the largest smaller eigenvalue of the structure tensor (Shi
+and Tomasi, 1994) around it, weighted towards the network's position, and to the peak of a parabola through it.
 """
 
 from __future__ import annotations

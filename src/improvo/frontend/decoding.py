@@ -101,7 +101,7 @@ def stability_probability(logits: Float32) -> Float32:
 def stability_map(logits: Float32, height: int, width: int) -> Float32:
     """Probability (height, width) that a keypoint at a pixel is stable, from logits (Hc, Wc, 2).
 
-    As the paper has it: the logits are interpolated, then the softmax taken.
+    As in the paper, the logits are interpolated, then the softmax is taken.
     """
     size = (logits.shape[1] * CELL, logits.shape[0] * CELL)
     # cv2.resize takes pixel areas to pixel areas: its centre of cell j is 8j + 3.5, as ours

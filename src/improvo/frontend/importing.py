@@ -1,4 +1,4 @@
-"""Public SuperPoint weights into ours: the three layouts in circulation, recognised by the names of their tensors.
+"""Converts public SuperPoint weights: three layouts, recognised by the names of their tensors.
 
 They differ in where batch norm sits: nowhere (the original release), before the ReLU, or after it. None has a
 stability head.

@@ -1,4 +1,4 @@
-"""Features of a frame on the pixels that are used: the one place where masks and frontends meet."""
+"""Features of a frame on its unmasked pixels: the one place where a mask is applied to a frontend."""
 
 from __future__ import annotations
 

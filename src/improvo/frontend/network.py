@@ -116,7 +116,7 @@ def prepare(image: Image) -> Float32:
     elif np.issubdtype(image.dtype, np.floating):
         scale = 1.0
         if not (image.min() >= 0 and image.max() <= 1):  # also false where there is a NaN
-            raise InputError("image of floats: the network reads values in [0, 1]; divide by 255, and mend NaN")
+            raise InputError("image of floats: the network reads values in [0, 1]; divide by 255, and replace NaN")
     else:
         raise InputError(f"image of type {image.dtype}: the network reads uint8, or floats in [0, 1]")
     grey = image

@@ -1,8 +1,8 @@
 """OpenVINO, imported without its telemetry: the one place that imports it, in every process.
 
-Left to itself, `import openvino` writes a client id into the user's home folder, counts how often it was imported, and
-reports it to a web service. It does so through a package of its own, `openvino_telemetry`, and goes without where that
-is not installed; so it is hidden while OpenVINO loads. A program that has imported OpenVINO before us is left alone.
+By default, `import openvino` writes a client id into the user's home folder, counts how often it was imported, and
+reports it to a web service. It uses the package `openvino_telemetry` for this, and works without it. So that package is
+hidden while OpenVINO loads. A program that has imported OpenVINO before us is left alone.
 """
 
 from __future__ import annotations

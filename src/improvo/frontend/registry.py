@@ -1,4 +1,4 @@
-"""Frontends by name. A new one is a class behind the `Frontend` protocol, and a line of `load_frontend`."""
+"""Frontends by name. A new one is a class like the protocol `Frontend`, and a branch of `load_frontend`."""
 
 from __future__ import annotations
 

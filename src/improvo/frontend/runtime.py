@@ -12,7 +12,7 @@ from improvo.types import Float32
 
 
 class NetworkMaps(NamedTuple):
-    """The network's answer for a batch; the arrays may be overwritten by the next call of the runtime."""
+    """The network's output for a batch; the arrays may be overwritten by the next call of the runtime."""
 
     heat: Float32  # (B, H, W) keypoint probability of every pixel: softmax over a cell, dustbin dropped
     descriptors: Float32  # (B, Hc, Wc, D) one per cell, not normalised

@@ -152,8 +152,9 @@ def _quantised_weight(weight: Float32) -> Any:
 def _spread(weight: Float32) -> Float32:
     """The first layer's weight (O, 1, 3, 3) as a sum over copies of the image (O, copies, 3, 3).
 
-    Eight bits are too few for the weights that read the image. Each is a whole number of steps four times finer, dealt
-    out to four copies; hardware adds products in fours anyway, so that they cost nothing.
+    Eight bits are too few for the weights of the first layer. Each weight is rounded to steps four times finer, and
+    split into a sum over four copies of the image. Processors add products in groups of four, so the copies cost no
+    time.
     """
     limit = np.abs(weight).max(axis=(1, 2, 3), keepdims=True)
     step = np.maximum(limit, 1e-30) / (INT8_MAX * INT8_IMAGE_COPIES)

@@ -1,4 +1,4 @@
-"""The torch runtime: for CUDA, and as the reference that the default runtime is held against."""
+"""The torch runtime: for CUDA, and as the reference for tests of the default runtime."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ _CHOICES = {
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """How a network turns an image into `Features`, but for the number of keypoints.
+    """How a network turns an image into `Features`, without the number of keypoints.
 
     Raises:
         ConfigError: a value out of range.
@@ -26,8 +26,8 @@ class NetworkOptions:
     threshold: float = 0.0005  # least probability of a keypoint
     nms_radius: int = 4  # pixels: a keypoint is the best of the square of this radius around it
     border: int = 4  # pixels: no keypoints this close to the image's edge
-    subpixel_radius: int = 4  # move to the centre of mass of the heat map within this radius; 0 leaves whole pixels
-    corner_radius: int = 5  # then move to the best corner this near, drop what has none; 0 skips this step
+    subpixel_radius: int = 4  # move to the centre of mass of the heat map within this radius; 0 keeps whole pixels
+    corner_radius: int = 5  # then move to the best corner within this radius, or drop; 0 skips this step
     runtime: Literal["auto", "openvino", "torch"] = "auto"  # auto: openvino on the CPU, torch where device is cuda
     precision: Literal["auto", "float32", "int8", "float16"] = "auto"  # auto: int8 if the weights are calibrated for it
     threads: int = 0  # 0: as many as the machine has
@@ -62,13 +62,13 @@ class NetworkSettings(NetworkOptions):
 
 @dataclass(frozen=True)
 class FrontendSettings:
-    """Which frontend, how many of its keypoints, and what the odometry makes of its stability."""
+    """Which frontend, how many keypoints, and how the odometry uses their stability."""
 
     name: str = DEFAULT_FRONTEND  # sift, orb, akaze, surf, a bundled network, or a .safetensors file
     max_keypoints: int = 1000  # kept per frame, best first
     use_stability: bool = True  # weigh observations with the frontend's stability, where it has one
-    least_stability: float = 0.0  # drop keypoints that the frontend's stability head gives less; 0 keeps all
-    network: NetworkOptions = field(default_factory=NetworkOptions)  # of a network alone
+    least_stability: float = 0.0  # drop keypoints of lower stability; 0 keeps all
+    network: NetworkOptions = field(default_factory=NetworkOptions)  # for networks only
 
     def __post_init__(self) -> None:
         if not 0 <= self.least_stability <= 1:

@@ -1,4 +1,4 @@
-"""A frontend that keeps to itself what its stability head does not trust (paper, "Visualizing Stability")."""
+"""A frontend that drops keypoints with a low stability (paper, "Visualizing Stability")."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from improvo.types import Features, Mask
 class StableOnly:
     """Drops keypoints whose stability is below a threshold, before they are matched.
 
-    Weighing (w_ij) keeps a doubtful point for where there is nothing better; dropping it keeps its wrong matches out of
-    the start and out of RANSAC as well.
+    A weight (w_ij) keeps an unstable keypoint in use where there is nothing better. Dropping it also keeps its wrong
+    matches out of initialisation and RANSAC.
 
     Args:
         frontend: with a stability head.

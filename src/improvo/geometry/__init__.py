@@ -1,1 +1,4 @@
-"""Cameras, rigid motions, alignment: pure NumPy, float64."""
+"""Cameras, calibration files, rigid motions, trajectory files, two-view geometry and triangulation.
+
+It imports `untrusted`. Open `camera.py` first, then `se3.py`. Everything is float64.
+"""

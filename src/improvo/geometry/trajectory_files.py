@@ -314,7 +314,7 @@ def read_times(path: Path) -> tuple[Float64, tuple[str, ...]]:
 
 def _counts(rows: list[list[str]]) -> bool:
     """Whether the first column only numbers the rows, and the second has the times."""
-    if len(rows) < 2 or not all(len(row) > 1 and row[0].isdigit() and _is_number(row[1]) for row in rows):
+    if len(rows) < 2 or not all(len(row) > 1 and row[0].isdecimal() and _is_number(row[1]) for row in rows):
         return False
     numbers, second = (np.array([float(row[column]) for row in rows]) for column in (0, 1))
     return bool((np.diff(numbers) == 1).all() and (np.diff(second) > 0).all())

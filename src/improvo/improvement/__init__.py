@@ -1,5 +1,6 @@
 """The self-improvement loop: rounds of labelling and training, each validated on video that training never sees.
 
-`improve` is the loop. `rounds` has the steps of a round, `split` says what is trained on and what is held back,
-`validation` measures a frontend and decides which of two is better, `folder` says what lies where on disk.
+It imports `report`, `evaluation`, `training`, `labeling`, `odometry`, `stability`, `sequences`, `frontend`, `jobs` and
+`untrusted`. Open `improve.py` first: the loop. `rounds` has the steps of a round, `split` says what is trained on and
+what is held back, `validation` measures a frontend and decides which of two is better.
 """

@@ -11,6 +11,7 @@ from typing import Any
 
 from improvo import config
 from improvo.continuation import SettingsRecord
+from improvo.errors import ConfigError
 from improvo.files import check_output_folder, make_output_folder
 from improvo.improvement.settings import ImproveSettings
 
@@ -65,7 +66,8 @@ class ImproveFolder:
     """OUT/
         settings.yaml          what the result depends on; other settings are refused
         split.json             which frames are trained on, and which held back
-        start/, round-1/ ...   a `Candidate` each
+        reference/             the fixed run that teaches and judges: labels, depth-training.zip, depth-held-back.zip
+        start/, round-1/ ...   a `Candidate` each; control/ is one too
         weights.safetensors    the best of them, with weights.json
         report.html
 
@@ -98,9 +100,9 @@ class ImproveFolder:
         return self.folder / "split.json"
 
     @property
-    def survey(self) -> Path:
-        """Label store of all sequences, only while it is being found out which of them can be labelled."""
-        return self.folder / "survey"
+    def reference(self) -> Path:
+        """Label store of the reference run: all recordings whole, with depth, by the frontend at the start."""
+        return self.folder / "reference"
 
     @property
     def start(self) -> Candidate:
@@ -110,6 +112,11 @@ class ImproveFolder:
     def round(self, number: int) -> Candidate:
         """The frontend that a round has trained."""
         return Candidate(f"round {number}", self.folder / f"round-{number}")
+
+    @property
+    def control(self) -> Candidate:
+        """The start, trained by homographies alone; never the best."""
+        return Candidate("control", self.folder / "control")
 
     def finished_rounds(self) -> int:
         """How many rounds are complete."""
@@ -128,13 +135,28 @@ class ImproveFolder:
         """What to look at."""
         return self.folder / "report.html"
 
+    @staticmethod
+    def _refuse_former(record: SettingsRecord) -> None:
+        """Folders without a reference were validated by other measures, which cannot be compared.
+
+        Raises:
+            ConfigError: it is such a folder.
+        """
+        if "reference" not in (record.read() or {}):
+            raise ConfigError(
+                f"{record.path.parent}: was begun by an earlier version, which measured otherwise; choose another "
+                "output folder (--frontend takes its weights.safetensors)"
+            )
+
     def _begin(self, values: dict[str, Any]) -> None:
-        free = [f"training.optimiser.{name}" for name in _FREE]
+        free = [f"{section}.optimiser.{name}" for section in ("training", "held") for name in _FREE]
+        free.append("control")  # it may be added later
         record = SettingsRecord(self.folder / "settings.yaml", ImproveSettings, free)
         if self.split.is_file():
+            self._refuse_former(record)
             record.check(values, "give the same again, or another output folder")
         elif record.difference(values):  # nothing has come of it yet
-            for folder in (self.survey, self.start.folder):
+            for folder in (self.reference, self.start.folder):
                 shutil.rmtree(folder, ignore_errors=True)
         make_output_folder(self.folder, COMMAND)
         record.write(values)

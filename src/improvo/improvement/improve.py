@@ -16,13 +16,16 @@ import numpy as np
 from improvo.files import make_output_folder
 from improvo.folder_lock import locked
 from improvo.frontend.weights import load_weights, save_weights
+from improvo.improvement.estimate import refuse_full_disk
 from improvo.improvement.folder import COMMAND, Candidate, ImproveFolder
 from improvo.improvement.progress import ImprovementProgress
+from improvo.improvement.recipe import Train, TrainingJob
+from improvo.improvement.reference import ReferencePart
 from improvo.improvement.report import write_report
-from improvo.improvement.rounds import Rounds, Train, starting_weights
+from improvo.improvement.rounds import Rounds, starting_weights
 from improvo.improvement.settings import ImproveSettings
 from improvo.improvement.split import Split
-from improvo.improvement.validation import Validation, is_better, rule, scores
+from improvo.improvement.validation import Validation, is_better, rule, summary
 
 if TYPE_CHECKING:
     from improvo.frontend.weights import DataSource
@@ -36,6 +39,7 @@ class Improvement:
     best: int  # its row in the following
     candidates: tuple[Candidate, ...]  # the first is the start
     validations: tuple[Validation, ...]
+    control: tuple[Candidate, Validation] | None = None  # the start, trained by homographies alone
 
 
 def improve(
@@ -62,7 +66,7 @@ def improve(
         ray: address of a Ray cluster that labels them, see `improvo.jobs.on_ray`.
         data: what the model card says about the recordings.
         progress: is told progress and results.
-        train: in place of `improvo.training.stages.train_odometry`.
+        train: in place of `improvo.improvement.recipe.train`.
 
     Raises:
         InputError: nothing could be labelled, or weights that cannot be read.
@@ -74,30 +78,54 @@ def improve(
     make_output_folder(output, COMMAND)
     with locked(output):
         folder = ImproveFolder(output, sequences, evaluate, settings, first_weights)
-        loop = Rounds(folder, settings, train or _train_odometry, data, workers, ray, progress)
+        loop = Rounds(folder, settings, train or _train, data, workers, ray, progress)
         split = loop.split(sequences, evaluate, first_weights)
         progress.split(split)
         start = loop.start(first_weights, split.training)
-        result = Improvement(folder.weights, 0, (start,), (loop.validate(start, split.held_back),))
-        progress.validated(start, result.validations[0], result.validations[0], better=None)
+        needed = loop.estimate(start, split, rounds)
+        progress.line(f"estimate: {needed.words}")
+        refuse_full_disk(output, needed)
+        teaching, judging = loop.reference(split)
+        result = Improvement(folder.weights, 0, (start,), (loop.validate(start, split.held_back, judging),))
+        progress.validated(start, result.validations[0], result.validations[0], settings.validation)
         _keep(result, folder, split, settings)
         for number in range(1, max(rounds, folder.finished_rounds()) + 1):
             teacher = result.candidates[result.best]
             candidate = folder.round(number)
             if not candidate.validation.is_file():
                 loop.label(teacher, split.training)
-                loop.train(candidate, number, teacher, split.training)
-            validation = loop.validate(candidate, split.held_back)
+                loop.train(candidate, number, teacher, split.training, teaching)
+            validation = loop.validate(candidate, split.held_back, judging)
             better = is_better(validation, result.validations[result.best], settings.validation)
-            progress.validated(candidate, validation, result.validations[0], better)
-            result = Improvement(
-                folder.weights,
-                number if better else result.best,
-                (*result.candidates, candidate),
-                (*result.validations, validation),
+            progress.validated(candidate, validation, result.validations[0], settings.validation, better)
+            result = replace(
+                result,
+                best=number if better else result.best,
+                candidates=(*result.candidates, candidate),
+                validations=(*result.validations, validation),
             )
+            if number == 1 and settings.control:
+                control = _control(loop, folder, result, split, (teaching, judging))
+                progress.validated(*control, result.validations[0], settings.validation)
+                result = replace(result, control=control)
             _keep(result, folder, split, settings)
         return result
+
+
+def _control(
+    loop: Rounds,
+    folder: ImproveFolder,
+    result: Improvement,
+    split: Split,
+    reference: tuple[list[ReferencePart], list[ReferencePart]],
+) -> tuple[Candidate, Validation]:
+    """What as many steps from the same start give by homographies of the same frames alone."""
+    start, trained = result.candidates[0], result.candidates[1]
+    control = folder.control
+    if not control.validation.is_file():
+        steps = int(load_weights(trained.weights).card.training.get("steps", 0))
+        loop.train(control, 1, start, split.training, reference[0], steps)
+    return control, loop.validate(control, split.held_back, reference[1])
 
 
 def _keep(result: Improvement, folder: ImproveFolder, split: Split, settings: ImproveSettings) -> None:
@@ -105,8 +133,9 @@ def _keep(result: Improvement, folder: ImproveFolder, split: Split, settings: Im
     if len(result.candidates) <= folder.finished_rounds():
         return
     best, validation = result.candidates[result.best], result.validations[result.best]
-    _publish(best, folder.weights, rule(settings.validation), scores(validation, result.validations[0]))
-    write_report(folder.report, result.candidates, result.validations, result.best, split, settings)
+    measures = summary(validation, result.validations[0], settings.validation)
+    _publish(best, folder.weights, rule(settings.validation), measures)
+    write_report(folder.report, result.candidates, result.validations, result.best, split, settings, result.control)
 
 
 def _publish(best: Candidate, target: Path, words: str, measures: dict[str, float]) -> None:
@@ -124,7 +153,7 @@ def _publish(best: Candidate, target: Path, words: str, measures: dict[str, floa
     save_weights(target, weights.tensors, card)
 
 
-def _train_odometry(*arguments: Any, **options: Any) -> dict[str, Any]:
-    from improvo.training.stages import train_odometry
+def _train(job: TrainingJob) -> dict[str, Any]:
+    from improvo.improvement.recipe import train
 
-    return train_odometry(*arguments, **options)
+    return train(job)

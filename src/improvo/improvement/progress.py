@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from improvo.improvement.folder import Candidate
+from improvo.improvement.settings import ValidationSettings
 from improvo.improvement.split import Split
-from improvo.improvement.validation import Validation, gain_interval
+from improvo.improvement.validation import Validation, gain, loose
 from improvo.labeling.store import DONE, SequenceRecord
 from improvo.terminal import progress
 
@@ -61,29 +62,35 @@ class ImprovementProgress:
             self.line(f"left out: {reason}")
         self.line(f"held back, never trained on: {split.words}")
 
-    def validated(self, candidate: Candidate, validation: Validation, start: Validation, better: bool | None) -> None:
+    def validated(
+        self,
+        candidate: Candidate,
+        validation: Validation,
+        start: Validation,
+        settings: ValidationSettings,
+        better: bool | None = None,
+    ) -> None:
         """A summary of one candidate.
 
         Args:
             candidate: the frontend.
             validation: what was measured of it.
             start: what was measured of the frontend at the start.
-            better: whether it is better than the best one before it; None for the start.
+            settings: of the validation.
+            better: whether it is better than the best one before it; None for the start and the control.
         """
-        gaps = " / ".join(map(str, validation.gaps))
-        counts = " / ".join(f"{validation.surviving(gap):.1f}" for gap in validation.gaps)
-        text = f"{candidate.name}: {counts} matches survive {gaps} frames, {validation.score:.1f} in all"
-        if better is not None:
-            text += f" ({gain_words(validation, start)})"
-        text += f"; {validation.tracked} of {validation.frames} frames tracked"
+        name = loose(settings.matches)
+        shares = " / ".join(f"{validation.mean(name, level):.3f}" for level in validation.levels)
+        gaps = ", ".join(validation.gap_words(level) for level in validation.levels)
+        text = (
+            f"{candidate.name}: {shares} of its matches are right within {settings.matches.right_px[1]:g} px at {gaps}"
+        )
+        if validation is not start:
+            text += f"; in all {gain_words(validation, start, settings)}"
+        text += f"; {validation.tracked} of {validation.frames} frames tracked in {validation.segments} segments"
         self.line(text if better is None else f"{text}; {'better, kept' if better else 'not better, not kept'}")
 
 
-def gain_words(validation: Validation, start: Validation) -> str:
-    """The gain in surviving matches over the start, with its interval."""
-    gain = validation.score - start.score
-    low, high = gain_interval(validation, start)
-    if start.score <= 0:
-        return f"{gain:+.1f}, 95 % interval {low:+.1f} to {high:+.1f}"
-    share = 100 / start.score
-    return f"{gain * share:+.0f} %, 95 % interval {low * share:+.0f} to {high * share:+.0f} %"
+def gain_words(validation: Validation, start: Validation, settings: ValidationSettings) -> str:
+    """The gain in the share of right matches over the start, all gaps together, with its interval."""
+    return gain(validation, start, loose(settings.matches), settings.matches).words

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from improvo.errors import InputError
-from improvo.evaluation.pose.unlabelled import spread_pairs
 from improvo.files import write_png
 from improvo.frontend.weights import load_weights
 from improvo.improvement.folder import Candidate
 from improvo.improvement.progress import gain_words
-from improvo.improvement.settings import ImproveSettings
+from improvo.improvement.settings import ImproveSettings, ValidationSettings
 from improvo.improvement.split import Part, Split
-from improvo.improvement.validation import Validation, rule
+from improvo.improvement.validation import Validation, gain, loose, rule, strict
 from improvo.labeling.store import DONE, read_records
 from improvo.report.improvement_page import Measure, Round, write_improvement_page
 from improvo.sequences import open_sequence
@@ -31,6 +31,7 @@ def write_report(
     best: int,
     split: Split,
     settings: ImproveSettings,
+    control: tuple[Candidate, Validation] | None = None,
 ) -> None:
     """Write `report.html` of all rounds so far.
 
@@ -40,12 +41,15 @@ def write_report(
         best: which of them is kept.
         split: what was held back.
         settings: of the loop.
+        control: what homographies alone give, if that was asked for.
     """
     start = validations[0]
     rounds = [
         _round(candidate, validation, split, settings, pictures=number in (0, best))
         for number, (candidate, validation) in enumerate(zip(candidates, validations, strict=True))
     ]
+    if control:
+        rounds.append(replace(_round(*control, split, settings, pictures=False), aside=True))
     names = ", ".join(one.name for one in split.training.paths[:3])
     if len(split.training.paths) > 3:
         names += f" and {len(split.training.paths) - 3} more"
@@ -57,39 +61,48 @@ def write_report(
         rounds,
         _notes(candidates, validations, split, settings),
         best,
-        _verdict(candidates, validations, best, settings),
+        _verdict(candidates, validations, best, settings, control),
+        _gains([*zip(candidates, validations, strict=True), *([control] if control else [])], settings.validation),
     )
 
 
 def _measures(start: Validation, settings: ImproveSettings) -> list[Measure]:
-    gaps = start.gaps
-    keypoints, pixels = settings.validation.survival.max_keypoints, settings.validation.survival.max_epipolar_error
+    judge = settings.validation.matches
+    against = "against the poses and depth of the reference run, mean over the pairs of frames held back"
     measures = [
         Measure(
-            _score_name(start),
-            f"mutual nearest neighbours of {keypoints} keypoints that agree with one epipolar geometry of the known "
-            f"camera within {pixels:g} pixels, mean over the pairs of frames held back",
-            digits=1,
+            _share_name(judge.right_px[1]),
+            f"mutual nearest neighbours of {judge.max_keypoints} keypoints that are right within "
+            f"{judge.right_px[1]:g} pixels {against}; all gaps together",
         )
     ]
-    if len(gaps) > 1:
-        measures += [Measure(f"matches that survive {gap} frames", "as above, of one gap", digits=1) for gap in gaps]
-    measures += [Measure(f"share of keypoints that survive {gap} frames", "as above, of all") for gap in gaps]
+    for limit in reversed(judge.right_px):
+        meaning = f"as above, within {limit:g} pixels, of one gap"
+        measures += [Measure(_share_name(limit, start.gap_words(level)), meaning) for level in start.levels]
+    for name in start.names:
+        if not name.startswith("right_"):
+            kind, solver = name.split("_", 1)
+            within = (
+                f"{judge.max_rotation_deg:g} degrees"
+                if kind == "rotation"
+                else f"{100 * judge.max_translation:g} % of the median depth"
+            )
+            meaning = f"share of pairs with an error of less than {within} {against}, {judge.shuffles} shuffles"
+            measures += [Measure(f"{kind}, {start.gap_words(level)}, {solver}", meaning) for level in start.levels]
     measures += [
         Measure("frames tracked", "share of the frames held back that the odometry gave a pose to", digits=3),
+        Measure("segments", "that the trajectory fell into", larger_is_better=False, digits=0),
         Measure("track length", "mean number of frames of a connect-the-dots track", digits=2),
         Measure("stable tracks", "share of the labelled tracks that are stable"),
         Measure("re-projection error, pixels", "median over labelled tracks", larger_is_better=False, digits=3),
     ]
-    for name in start.pose:
-        limit = "5 degrees" if name.startswith("rotation") else "5 cm"
-        measures.append(Measure(name, f"pose protocol, with depth: share of pairs with an error of less than {limit}"))
+    for name in start.truth:
+        measures.append(Measure(f"true: {name}", "pose protocol, by the recording's own depth and true poses"))
     return measures
 
 
-def _score_name(validation: Validation) -> str:
-    one = len(validation.gaps) == 1
-    return f"matches that survive {validation.gaps[0]} frames" if one else "matches that survive, summed over the gaps"
+def _share_name(limit: float, gap: str = "") -> str:
+    return f"share of right matches, {limit:g} px, {gap}" if gap else f"share of right matches, {limit:g} px"
 
 
 def _training_losses(folder: Path) -> dict[str, list[float]]:
@@ -99,17 +112,24 @@ def _training_losses(folder: Path) -> dict[str, list[float]]:
     return {name: [float(row[name]) for row in rows] for name in names}
 
 
-def _values(validation: Validation) -> dict[str, float]:
-    values = {_score_name(validation): validation.score}
-    for gap in validation.gaps:
-        values[f"matches that survive {gap} frames"] = validation.surviving(gap)
-        values[f"share of keypoints that survive {gap} frames"] = validation.share[str(gap)]
+def _values(validation: Validation, settings: ValidationSettings) -> dict[str, float]:
+    judge = settings.matches
+    values = {_share_name(judge.right_px[1]): validation.mean(loose(judge))}
+    for name, limit in zip((strict(judge), loose(judge)), judge.right_px, strict=True):
+        for level in validation.levels:
+            values[_share_name(limit, validation.gap_words(level))] = validation.mean(name, level)
+    for name in validation.names:
+        if not name.startswith("right_"):
+            kind, solver = name.split("_", 1)
+            for level in validation.levels:
+                values[f"{kind}, {validation.gap_words(level)}, {solver}"] = validation.mean(name, level)
     values["frames tracked"] = validation.tracked / max(validation.frames, 1)
+    values["segments"] = validation.segments
     values["track length"] = validation.track_length
     values["stable tracks"] = validation.stable_share
     if validation.error == validation.error:
         values["re-projection error, pixels"] = validation.error
-    return {**values, **validation.pose}
+    return {**values, **{f"true: {name}": value for name, value in validation.truth.items()}}
 
 
 def _round(
@@ -127,7 +147,7 @@ def _round(
         seconds = {"train": float(trained["seconds"]), **seconds}
     return Round(
         candidate.name,
-        _values(validation),
+        _values(validation, settings.validation),
         labels,
         seconds,
         _pictures(candidate, split, validation, settings) if pictures else (),
@@ -135,15 +155,36 @@ def _round(
     )
 
 
+def _gains(judged: Sequence[tuple[Candidate, Validation]], settings: ValidationSettings) -> list[list[str]]:
+    """Header, then for each frontend after the first its gain in right matches over the first, with intervals."""
+    (_, start), *others = judged
+    rows = [["right matches", "all gaps", *(start.gap_words(level) for level in start.levels)]]
+    for candidate, validation in others:
+        names, limits = (loose(settings.matches), strict(settings.matches)), settings.matches.right_px[::-1]
+        for name, limit in zip(names, limits, strict=True):
+            gains = (gain(validation, start, name, settings.matches, level) for level in (None, *start.levels))
+            rows.append([f"{candidate.name}, {limit:g} px", *(found.words for found in gains)])
+    return rows
+
+
 def _verdict(
-    candidates: Sequence[Candidate], validations: Sequence[Validation], best: int, settings: ImproveSettings
+    candidates: Sequence[Candidate],
+    validations: Sequence[Validation],
+    best: int,
+    settings: ImproveSettings,
+    control: tuple[Candidate, Validation] | None,
 ) -> str:
-    words = rule(settings.validation)
+    start, how = validations[0], settings.validation
+    words = rule(how)
     if best:
-        gain = gain_words(validations[best], validations[0])
-        return f"{words} Kept: {candidates[best].name}; matches that survive against the start: {gain}."
-    if len(candidates) > 1:
-        return f"{words} No round was better than the start: the weights kept are those at the start, unchanged."
+        words += f" Kept: {candidates[best].name}; right matches against the start: "
+        words += f"{gain_words(validations[best], start, how)}."
+    elif len(candidates) > 1:
+        words += " No round was better than the start: the weights kept are those at the start, unchanged."
+        words += f" {candidates[-1].name}: {gain_words(validations[-1], start, how)}."
+    if control:
+        words += " The control, trained for as many steps on the same frames by homographies alone: "
+        words += f"{gain_words(control[1], start, how)}."
     return words
 
 
@@ -151,12 +192,12 @@ def _notes(
     candidates: Sequence[Candidate], validations: Sequence[Validation], split: Split, settings: ImproveSettings
 ) -> list[str]:
     start, notes = validations[0], list[str]()
-    if start.gaps != settings.validation.survival.gaps:
-        missing = " and ".join(str(gap) for gap in settings.validation.survival.gaps if gap not in start.gaps)
-        used = " and ".join(map(str, start.gaps))
+    wanted = len(settings.validation.gaps or settings.validation.overlaps)
+    if len(start.levels) < wanted:
+        gaps = " and ".join(start.gap_words(level) for level in start.levels)
         notes.append(
-            f"What is held back is too short for pairs {missing} frames apart: judged by pairs {used} frames apart. "
-            "Short gaps are easy; judge by longer recordings before you believe a small gain."
+            f"What is held back is too short for {wanted} gaps: judged by pairs {gaps} apart. Short gaps are easy; "
+            "judge by longer recordings before you believe a small gain."
         )
     notes += [f"Left out: {reason}" for reason in split.unusable]
     for candidate, validation in zip(candidates, validations, strict=True):
@@ -194,14 +235,12 @@ def _draw_matches(
     from improvo.frontend.registry import load_frontend
     from improvo.report.match_picture import paint_matches
 
-    frontend = load_frontend(str(candidate.weights), settings.validation.survival.max_keypoints)
+    frontend = load_frontend(str(candidate.weights), settings.validation.matches.max_keypoints)
     frontend.name = candidate.name
     sequence = open_sequence(part.paths[0], part.sequence)
-    pairs = spread_pairs(len(sequence), validation.gaps[0], settings.validation.survival.pairs)
-    if len(pairs) == 0:
-        raise InputError(f"{part.paths[0]}: too short for a pair")
-    a, b = (int(row) for row in pairs[len(pairs) // 2])
-    first, second = sequence[a], sequence[b]
+    gap = min(validation.scores[0].gap, len(sequence) - 1)
+    a = (len(sequence) - gap) // 2
+    first, second = sequence[a], sequence[a + gap]
     masks = first.mask, second.mask
     picture = paint_matches(frontend, first.image, second.image, None, sequence.camera, width=_PANEL, masks=masks)
     write_png(target, picture)

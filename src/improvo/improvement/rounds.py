@@ -4,20 +4,31 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from improvo.errors import ConfigError, InputError, OutputError
 from improvo.frontend.weights import find_weights, load_weights, save_weights
+from improvo.geometry.camera import Camera
+from improvo.improvement.estimate import Estimate, estimate
 from improvo.improvement.folder import Candidate, ImproveFolder
+from improvo.improvement.measuring import pairs_of, validate
 from improvo.improvement.progress import ImprovementProgress
-from improvo.improvement.settings import ImproveSettings
+from improvo.improvement.recipe import Train, TrainingJob
+from improvo.improvement.reference import (
+    HELD_BACK,
+    TRAINING,
+    ReferencePart,
+    make_depth,
+    reference_parts,
+    refuse_without_depth,
+)
+from improvo.improvement.settings import HELD, ImproveSettings
 from improvo.improvement.split import (
     Part,
     Split,
@@ -27,30 +38,15 @@ from improvo.improvement.split import (
     split_last_part,
     split_whole_sequences,
 )
-from improvo.improvement.validation import Validation, read_validation, validate
+from improvo.improvement.validation import Validation, read_validation
 from improvo.labeling.label_sequences import label_sequences
 from improvo.labeling.store import DONE, SequenceRecord, read_records
 from improvo.sequences import Sequence as ImageSequence
 from improvo.sequences import SequenceSettings, open_sequence
-from improvo.training.settings import OdometryTrainingSettings
 from improvo.types import UInt8
 
 if TYPE_CHECKING:
     from improvo.frontend.weights import DataSource
-
-
-class Train(Protocol):
-    """What trains; `improvo.training.stages.train_odometry`."""
-
-    def __call__(
-        self,
-        labels: Sequence[Path],
-        settings: OdometryTrainingSettings,
-        output: Path,
-        start: Path,
-        data: tuple[DataSource, ...] = (),
-        progress: bool = True,
-    ) -> dict[str, Any]: ...
 
 
 class Rounds:
@@ -98,9 +94,7 @@ class Rounds:
                 else self._survey(sequences, weights_file)
             )
 
-        split = remembered_split(self._folder.split, choose)
-        shutil.rmtree(self._folder.survey, ignore_errors=True)
-        return split
+        return remembered_split(self._folder.split, choose)
 
     def start(self, weights_file: Path, part: Part) -> Candidate:
         """The candidate at the start: weights as given; where int8 lacks their activation ranges, those are added."""
@@ -114,42 +108,117 @@ class Rounds:
                 write_calibrated(weights_file, candidate.weights, calibration_images(part, self._images))
         return candidate
 
+    def estimate(self, start: Candidate, split: Split, rounds: int) -> Estimate:
+        """Roughly what all of it takes; nothing of what is done already is taken off."""
+        parts = split.training, split.held_back
+        training, held_back = (sum(_length(path, part.sequence) for path in part.paths) for part in parts)
+        camera = _camera(parts[0])
+        parameters = sum(tensor.size for tensor in load_weights(start.weights).tensors.values())
+        return estimate(self._settings, rounds, training, held_back, camera.width * camera.height, parameters)
+
+    def reference(self, split: Split) -> tuple[list[ReferencePart], list[ReferencePart]]:
+        """The fixed run over all frames, with depth of either part from its own frames: training, held back.
+
+        Raises:
+            InputError: one of the parts has no depth.
+            OutputError: it cannot be written (full disk).
+        """
+        store, settings = self._folder.reference, self._settings.reference
+        paths = list(dict.fromkeys(path.resolve() for path in (*split.training.paths, *split.held_back.paths)))
+        done = {record.path for record in read_records(store) if record.state == DONE} if store.is_dir() else set()
+        if not all(str(path) in done for path in paths):
+            self._label(self._folder.start, paths, self._settings.sequence, store, "reference")
+        found = []
+        for kind, part, most in (
+            (TRAINING, split.training, settings.most_training),
+            (HELD_BACK, split.held_back, settings.most_held_back),
+        ):
+            parts = reference_parts(store, part, kind)
+            missing = [one for one in parts if not one.depth_file.is_file()]
+            with self._progress.bar(f"depth of the reference, {kind}", "frame") as tick:
+                for one in missing:
+                    make_depth(one, max(most // len(parts), 2), settings, tick)
+            found.append(parts)
+        mend = "record with a moving camera, or hold back other recordings with --evaluate"
+        refuse_without_depth(found[0], "the training part", mend)
+        refuse_without_depth(found[1], "what is held back", mend)
+        return found[0], found[1]
+
     def label(self, teacher: Candidate, part: Part) -> list[SequenceRecord]:
         """Stability labels of the training part, made with the teacher."""
-        return self._label(teacher, list(part.paths), part.sequence, teacher.labels, "training part")
+        self._share(teacher, part, teacher.labels)
+        try:
+            return self._label(teacher, list(part.paths), part.sequence, teacher.labels, "training part")
+        except InputError:  # dense pairs teach without labels
+            if self._settings.recipe != HELD:
+                raise
+            return _refuse_unwritten(read_records(teacher.labels))
 
-    def train(self, candidate: Candidate, number: int, teacher: Candidate, part: Part) -> None:
-        """The candidate of a round: the teacher's weights, trained on the teacher's labels.
+    def train(
+        self,
+        candidate: Candidate,
+        number: int,
+        teacher: Candidate,
+        part: Part,
+        reference: Sequence[ReferencePart],
+        steps: int = 0,
+    ) -> None:
+        """The candidate of a round: the teacher's weights, trained on.
 
         Args:
-            candidate: of the round; nothing is done where its weights are there already.
+            candidate: of the round, or the control; nothing is done where its weights are there already.
             number: of the round, from 1.
             teacher: the best candidate before it.
             part: the training part.
+            reference: of the training part.
+            steps: of the control.
         """
         if candidate.weights.is_file():
             return
         candidate.folder.mkdir(exist_ok=True)
-        optimiser = self._settings.training.optimiser
-        # another try from the same weights and labels must not be the same try
-        settings = replace(self._settings.training, optimiser=replace(optimiser, seed=optimiser.seed + number - 1))
-        shown = self._progress.shown
-        self._train([teacher.labels], settings, candidate.training, teacher.weights, self._data, progress=shown)
+        settings = self._settings
+        seed = (settings.held if settings.recipe == HELD else settings.training).optimiser.seed
+        job = TrainingJob(
+            settings,
+            seed + number - 1,  # another try from the same weights and labels must not be the same try
+            teacher.weights,
+            candidate.training,
+            teacher.labels,
+            tuple(reference),
+            control=candidate == self._folder.control,
+            steps=steps,
+            data=self._data,
+            progress=self._progress.shown,
+        )
+        self._train(job)
         images = calibration_images(part, self._images)
         write_calibrated(candidate.training / "weights.safetensors", candidate.weights, images)
 
-    def validate(self, candidate: Candidate, part: Part) -> Validation:
+    def validate(self, candidate: Candidate, part: Part, reference: Sequence[ReferencePart]) -> Validation:
         """How good a candidate is on what was held back."""
         if candidate.validation.is_file():
             return read_validation(candidate.validation)
+        self._share(candidate, part, candidate.held_back)
         try:
             records = self._label(candidate, list(part.paths), part.sequence, candidate.held_back, "held back")
         except InputError:  # none of it: the matches can be measured all the same
             records = _refuse_unwritten(read_records(candidate.held_back))
             if not records:
                 raise
-        with self._progress.bar(f"{candidate.name}, surviving matches", "pair") as tick:
-            return validate(candidate, part, records, self._settings.validation, tick, self._progress.shown)
+        settings = self._settings.validation
+        pairs = sum(len(pairs) for one in reference for pairs in pairs_of(one.fixed_run(), settings))
+        with self._progress.bar(f"{candidate.name}, matches against the reference", "pair", pairs) as tick:
+            return validate(candidate, part, reference, records, settings, tick, self._progress.shown)
+
+    def _share(self, candidate: Candidate, part: Part, store: Path) -> None:
+        """Whole recordings were labelled by the start for the reference already."""
+        reference = self._folder.reference
+        if candidate != self._folder.start or part.sequence != self._settings.sequence or not reference.is_dir():
+            return
+        records = read_records(reference)
+        done = {record.path for record in records if record.state == DONE}
+        if all(str(path.resolve()) in done for path in part.paths):
+            share_labels(reference, records, part, store)
 
     @property
     def _images(self) -> int:
@@ -159,13 +228,8 @@ class Rounds:
         """Label all sequences whole, then hold back some of those that have labels."""
         settings = self._settings
         candidate = self.start(weights_file, _readable_beginning(sequences, settings.sequence, settings.split.share))
-        store = self._folder.survey
-        records = self._label(candidate, list(sequences), settings.sequence, store, "all sequences")
-        split = split_whole_sequences(records, settings.sequence, settings.split.share)
-        if sum(record.state == DONE for record in records) > 1:
-            share_labels(store, records, split.training, candidate.labels)
-            share_labels(store, records, split.held_back, candidate.held_back)
-        return split
+        records = self._label(candidate, list(sequences), settings.sequence, self._folder.reference, "all sequences")
+        return split_whole_sequences(records, settings.sequence, settings.split.share)
 
     def _label(
         self, candidate: Candidate, paths: list[Path], how: SequenceSettings, store: Path, what: str
@@ -183,6 +247,14 @@ class Rounds:
                 on_frames=tick,
             )
         return _refuse_unwritten(records)
+
+
+def _camera(part: Part) -> Camera:
+    """Of the first recording that can be opened."""
+    for path in part.paths[:-1]:
+        with suppress(InputError):
+            return open_sequence(path, part.sequence).camera
+    return open_sequence(part.paths[-1], part.sequence).camera
 
 
 def _length(path: Path, how: SequenceSettings) -> int:

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from improvo.depth.settings import DepthSettings
 from improvo.errors import ConfigError
-from improvo.evaluation.settings import SurvivalSettings
+from improvo.evaluation.pose.self_truth import SelfTruthSettings
 from improvo.frontend.settings import FrontendSettings
 from improvo.odometry.run_settings import RunSettings
 from improvo.odometry.settings import OdometrySettings
 from improvo.sequences.base import SequenceSettings
 from improvo.stability.settings import LabelSettings
-from improvo.training.settings import OdometryTrainingSettings, OptimiserSettings
+from improvo.training.settings import DevicePairSettings, HeldSettings, OdometryTrainingSettings, OptimiserSettings
 
-DEFAULT_START = "superpoint"
+DEFAULT_START = "superpoint-small"  # on a CPU a step takes a quarter of the time of one of `superpoint`
+HELD, TRACKS = "held", "tracks"
+RECIPES = (HELD, TRACKS)
 
 
 @dataclass(frozen=True)
@@ -28,12 +31,50 @@ class SplitSettings:
 
 
 @dataclass(frozen=True)
+class ReferenceSettings:
+    """The fixed run of the frontend at the start, whose poses and depth teach and judge."""
+
+    frames_per_second: float = 10.0  # that get a depth map, at least, of a long recording
+    dense_up_to: int = 300  # frames of a short one that get a depth map, more often than so
+    most_training: int = 900  # frames with a depth map, of all recordings together
+    most_held_back: int = 300
+    stretch_seconds: float = 10.0  # where there are more, whole stretches of this length are left out
+    least_known: float = 0.05  # share of the pixels; a map that knows less is not kept
+    depth: DepthSettings = field(default_factory=DepthSettings)
+
+    def __post_init__(self) -> None:
+        if self.frames_per_second <= 0 or self.stretch_seconds <= 0:
+            raise ConfigError("settings `reference.frames_per_second` and `reference.stretch_seconds`: must be above 0")
+        if min(self.dense_up_to, self.most_training, self.most_held_back) < 2:
+            raise ConfigError(
+                "settings `reference.dense_up_to`, `most_training` and `most_held_back`: at least 2 frames each"
+            )
+        if not 0 <= self.least_known <= 1:
+            raise ConfigError(f"reference.least_known={self.least_known}: is a share between 0 and 1")
+
+
+@dataclass(frozen=True)
 class ValidationSettings:
     """How the rounds are compared."""
 
-    survival: SurvivalSettings = field(default_factory=SurvivalSettings)
+    matches: SelfTruthSettings = field(default_factory=lambda: SelfTruthSettings(pairs=100))
+    gaps: tuple[int, ...] = ()  # frames between the two images of a pair; by default as far as `overlaps` says
+    # share of a frame that the other one still shows, one for each gap; held in the hand about 1, 2 and 3 seconds
+    overlaps: tuple[float, ...] = (0.65, 0.5, 0.4)
+    min_pairs: int = 10  # of a gap; what is held back is too short for wider ones
     frames_lost: float = 0.01  # share of the frames tracked by the best frontend so far that a better one may lose
+    segments_more: int = 0  # than with the best frontend so far, by which the odometry of a better one may break
     calibration_images: int = 24  # training frames that activation ranges are measured on, for the int8 runtime
+
+    def __post_init__(self) -> None:
+        if any(gap < 1 for gap in self.gaps) or len(set(self.gaps)) < len(self.gaps):
+            raise ConfigError(f"validation.gaps={list(self.gaps)}: give different numbers of frames, each 1 or more")
+        if not self.overlaps or not all(0 < share < 1 for share in self.overlaps):
+            raise ConfigError("validation.overlaps: give shares between 0 and 1")
+        if sorted(self.overlaps, reverse=True) != list(self.overlaps):
+            raise ConfigError("validation.overlaps: give the largest first")
+        if self.min_pairs < 1:
+            raise ConfigError(f"validation.min_pairs={self.min_pairs}: must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -45,12 +86,36 @@ class ImproveSettings:
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     labels: LabelSettings = field(default_factory=LabelSettings)
     split: SplitSettings = field(default_factory=SplitSettings)
-    training: OdometryTrainingSettings = field(
+    reference: ReferenceSettings = field(default_factory=ReferenceSettings)
+    # held: descriptors from dense pairs and tracks, the other heads held to the start's. tracks: all heads from tracks
+    recipe: str = HELD
+    control: bool = False  # also train, from the same start, by homographies of the same frames alone, and show it
+    minutes: float = 0.0  # that training may take in each round; 0: as many steps as the following say
+    # for each frame of the training part, at least 300 in all and at most `held.optimiser.steps`; 0: exactly those
+    steps_per_frame: float = 3.0
+    held: HeldSettings = field(
+        default_factory=lambda: HeldSettings(
+            pairs=DevicePairSettings(group=1),
+            optimiser=OptimiserSettings(  # 1200 steps take a quarter of an hour on two calm cores
+                steps=1200, batch_size=2, learning_rate=5e-4, decay_steps=400, warmup_steps=50, workers=0
+            ),
+        )
+    )
+    training: OdometryTrainingSettings = field(  # of the recipe `tracks`
         default_factory=lambda: OdometryTrainingSettings(
             optimiser=OptimiserSettings(steps=1000, decay_steps=350, learning_rate=5e-4)
         )
     )
     validation: ValidationSettings = field(default_factory=ValidationSettings)
+
+    def __post_init__(self) -> None:
+        if self.recipe not in RECIPES:
+            raise ConfigError(f"recipe `{self.recipe}`: unknown; choose {' or '.join(RECIPES)}")
+        for name in ("minutes", "steps_per_frame"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise ConfigError(f"{name}={getattr(self, name):g}: must be 0 or more")
+        if self.minutes and self.recipe != HELD:
+            raise ConfigError("minutes: only the recipe `held` chooses its steps by time; give steps instead")
 
     def run_settings(self, sequence: SequenceSettings, frontend: FrontendSettings) -> RunSettings:
         """The odometry's settings for some frames and a frontend."""

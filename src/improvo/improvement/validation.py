@@ -1,10 +1,8 @@
-"""Measuring a frontend on what was held back, with and without ground truth, and which of two is better."""
+"""What is known of a frontend on what was held back, and which of two is better."""
 
 from __future__ import annotations
 
-import time
-from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -12,24 +10,28 @@ import numpy as np
 
 from improvo import config
 from improvo.errors import ConfigError, InputError
-from improvo.evaluation.pose.pairs import draw_pairs
-from improvo.evaluation.pose.unlabelled import Survival, surviving_matches, usable_gaps
-from improvo.evaluation.settings import PoseSettings
-from improvo.evaluation.sources import LoadedFrontend, Recorded
-from improvo.evaluation.statistics import Bootstrap
-from improvo.evaluation.trajectory.protocol import clean_truth
+from improvo.evaluation.pose.self_truth import PairScores, SelfTruthSettings, compare_gaps
 from improvo.files import write_json
-from improvo.improvement.folder import Candidate
 from improvo.improvement.settings import ValidationSettings
-from improvo.improvement.split import Part
-from improvo.jobs.pool import Workers
-from improvo.labeling.labeled import LabeledSequence, read_labels
-from improvo.labeling.store import DONE, SequenceRecord
-from improvo.sequences import Sequence, open_sequence
-from improvo.stability.rule import IGNORE
 from improvo.untrusted.text import read_json_file
 
-_RESAMPLES, _CONFIDENCE = 1000, 0.95
+
+@dataclass(frozen=True)
+class GapScores:
+    """The pairs of one recording at one gap, the same ones for every frontend."""
+
+    recording: str
+    level: int  # 0 for the nearest gap
+    gap: int  # frames
+    seconds: float
+    pairs: list[list[int]]  # frames of the reference run
+    matches: list[int]  # of each pair, whose keypoint has depth
+    values: dict[str, list[float]]  # of each pair, see `score_pairs`
+
+    def scores(self) -> PairScores:
+        """As the judge wants them."""
+        values = {name: np.array(each, np.float64) for name, each in self.values.items()}
+        return PairScores(self.gap, np.array(self.pairs, np.int64), np.array(self.matches, np.int64), values)
 
 
 @dataclass(frozen=True)
@@ -38,38 +40,98 @@ class Validation:
 
     frames: int  # that the odometry was given
     tracked: int  # that it gave a pose to
+    segments: int  # that the trajectory fell into
     track_length: float  # mean number of frames
     stable_share: float  # stable / (stable + unstable) tracks
     error: float  # median re-projection error of labelled tracks, pixels; NaN without any
     labels: dict[str, int]  # tracks by label
-    agreeing: dict[str, list[int]]  # gap -> surviving matches of every pair
-    share: dict[str, float]  # gap -> mean share of keypoints that survive
-    pose: dict[str, float] = field(default_factory=dict)  # success rates, where there are depth and true poses
+    scores: tuple[GapScores, ...]  # against the reference run
+    truth: dict[str, float] = field(default_factory=dict)  # by the pose protocol, where there are depth and true poses
     failures: tuple[str, ...] = ()  # sequences that got no labels, with the reason
     seconds: dict[str, float] = field(default_factory=dict)
 
     @property
-    def gaps(self) -> tuple[int, ...]:
-        """Frames between the two images of a pair."""
-        return tuple(int(gap) for gap in self.agreeing)
-
-    def surviving(self, gap: int) -> float:
-        """Mean number of surviving matches of a pair."""
-        counts = self.agreeing[str(gap)]
-        return float(np.mean(counts)) if counts else 0.0
+    def levels(self) -> tuple[int, ...]:
+        """The gaps by their number, the nearest first."""
+        return tuple(sorted({scores.level for scores in self.scores}))
 
     @property
-    def score(self) -> float:
-        """Surviving matches of a pair, summed over the gaps."""
-        return sum(self.surviving(gap) for gap in self.gaps)
+    def names(self) -> tuple[str, ...]:
+        """Of the values of every pair."""
+        return tuple(self.scores[0].values)
+
+    def mean(self, name: str, level: int | None = None) -> float:
+        """Mean of a value over the pairs of a gap, or of all gaps with the same weight."""
+        chosen = [scores for scores in self.scores if level in (None, scores.level)]
+        return float(np.mean([np.mean(scores.values[name]) for scores in chosen]))
+
+    def gap_words(self, level: int) -> str:
+        """The gap in frames and seconds, for a person; the range of it over the recordings."""
+        chosen = [scores for scores in self.scores if scores.level == level]
+        frames = _range([scores.gap for scores in chosen])
+        return f"{frames} frames ({_range([scores.seconds for scores in chosen])} s)"
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What a frontend adds to another one, over the same pairs."""
+
+    before: float
+    after: float
+    low: float  # of the 95 % interval of the difference
+    high: float
+
+    @property
+    def difference(self) -> float:
+        """After minus before."""
+        return self.after - self.before
+
+    @property
+    def words(self) -> str:
+        """In per cent of what it was before, with the interval."""
+        if self.before <= 0:
+            return f"{self.difference:+.3f}, 95 % interval {self.low:+.3f} to {self.high:+.3f}"
+        share = 100 / self.before
+        low, high = self.low * share, self.high * share
+        return f"{self.difference * share:+.1f} %, 95 % interval {low:+.1f} to {high:+.1f} %"
+
+
+def loose(settings: SelfTruthSettings) -> str:
+    """The value that decides: the share of matches that are right within the wider limit."""
+    return f"right_{settings.right_px[1]:g}px"
+
+
+def strict(settings: SelfTruthSettings) -> str:
+    """The share of matches that are right within the narrower limit."""
+    return f"right_{settings.right_px[0]:g}px"
+
+
+def gain(
+    candidate: Validation, before: Validation, name: str, settings: SelfTruthSettings, level: int | None = None
+) -> Gain:
+    """What a frontend adds to another one, with the interval over paired resamples of the pairs.
+
+    Args:
+        candidate, before: measured on the same pairs.
+        name: of the value.
+        settings: of the intervals.
+        level: of the gap; all gaps together, each with the same weight, where it is None.
+    """
+    first, second = (
+        [_only(scores.scores(), name) for scores in validation.scores if level in (None, scores.level)]
+        for validation in (before, candidate)
+    )
+    found = compare_gaps(first, second, settings)[name]
+    return Gain(found["first"], found["second"], *found["interval"])
 
 
 def rule(settings: ValidationSettings) -> str:
     """The decision rule, in a sentence."""
     return (
-        "A frontend is better than the best one before it if more of its matches survive on the frames held back, "
-        "summed over the gaps, by more than chance (95 % interval), and the odometry loses with it no more than "
-        f"{100 * settings.frames_lost:g} % of the frames that it tracked with the other."
+        f"A frontend is better than the best one before it if a larger share of its matches is right within "
+        f"{settings.matches.right_px[1]:g} pixels on the frames held back, at all gaps together and by more than "
+        f"chance (95 % interval), and the odometry is not worse with it: it loses no more than "
+        f"{100 * settings.frames_lost:g} % of the frames that it tracked with the other, and breaks no more often."
     )
 
 
@@ -79,40 +141,22 @@ def is_better(candidate: Validation, best: Validation, settings: ValidationSetti
     Args:
         candidate: what was measured of it.
         best: what was measured of the best one, on the same frames and pairs.
-        settings: how many frames it may lose.
+        settings: what its odometry may lose.
     """
     kept = candidate.tracked >= (1 - settings.frames_lost) * best.tracked
-    return kept and gain_interval(candidate, best)[0] > 0
+    whole = candidate.segments <= best.segments + settings.segments_more
+    return kept and whole and gain(candidate, best, loose(settings.matches), settings.matches).low > 0
 
 
-def gain_interval(candidate: Validation, before: Validation, seed: int = 0) -> tuple[float, float]:
-    """95 % interval of the gain in score, over paired resamples of the pairs, gap by gap.
-
-    Args:
-        candidate: what was measured of a frontend.
-        before: what was measured of another one, on the same pairs.
-        seed: of the resamples.
-
-    Returns:
-        Lower and upper bound, in surviving matches.
-    """
-    gain = spread = 0.0
-    for gap in before.gaps:
-        gains = np.array(candidate.agreeing[str(gap)]) - np.array(before.agreeing[str(gap)])
-        if len(gains) == 0:
-            continue
-        mean = float(gains.mean())
-        lower, upper = Bootstrap(len(gains), seed, _RESAMPLES, _CONFIDENCE).interval(gains)
-        gain += mean
-        spread += max(upper - mean, mean - lower)  # the gaps share frames: taken as fully dependent
-    return gain - spread, gain + spread
-
-
-def scores(validation: Validation, start: Validation) -> dict[str, float]:
-    """What the model card says of the best: surviving matches, its own and those at the start."""
-    values = {f"surviving_matches_{gap}": validation.surviving(gap) for gap in validation.gaps}
-    values |= {f"surviving_matches_{gap}_at_the_start": start.surviving(gap) for gap in start.gaps}
-    return {name: round(value, 3) for name, value in values.items()}
+def summary(validation: Validation, start: Validation, settings: ValidationSettings) -> dict[str, float]:
+    """What the model card says of the best: shares of right matches, its own and those at the start."""
+    values: dict[str, float] = {}
+    for name in (strict(settings.matches), loose(settings.matches)):
+        for level in validation.levels:
+            gap = next(scores.gap for scores in validation.scores if scores.level == level)
+            values[f"{name}_gap_{gap}"] = validation.mean(name, level)
+            values[f"{name}_gap_{gap}_at_the_start"] = start.mean(name, level)
+    return {name: round(value, 4) for name, value in values.items()}
 
 
 def write_validation(path: Path, validation: Validation) -> None:
@@ -131,138 +175,30 @@ def read_validation(path: Path) -> Validation:
     error = values.get("error", 0.0)
     try:
         found = config.from_dict(Validation, {**values, "error": float("nan") if error is None else error})
-        whole = bool(found.agreeing) and found.agreeing.keys() == found.share.keys()
-        whole &= all(gap.isdecimal() and len(gap) < 9 for gap in found.agreeing)
-        whole &= {"label", "evaluate"} <= found.seconds.keys()
-        numbers = [found.track_length, found.stable_share, *found.share.values(), *found.pose.values()]
-        if not (whole and np.isfinite(numbers).all()):
+        if not (_belongs_together(found) and {"label", "evaluate"} <= found.seconds.keys()):
             raise ConfigError("values that do not belong together")
     except ConfigError:
         raise InputError(f"{path}: is damaged; {mend}") from None
     return found
 
 
-def validate(
-    candidate: Candidate,
-    part: Part,
-    records: list[SequenceRecord],
-    settings: ValidationSettings,
-    tick: Callable[[], None] = lambda: None,
-    progress: bool = False,
-) -> Validation:
-    """Measure a candidate and keep the result.
-
-    Args:
-        candidate: `candidate.held_back` has its labels of the part already.
-        part: what was held back.
-        records: of those labels.
-        settings: of the validation.
-        tick: called after every pair of frames.
-        progress: whether the pose protocol shows a bar.
-    """
-    from improvo.frontend.registry import load_frontend
-
-    started = time.perf_counter()
-    sequences = [opened for path in part.paths if (opened := _opened(path, part)) is not None]
-    gaps = usable_gaps([len(sequence) for sequence in sequences], settings.survival)
-    frontend = load_frontend(str(candidate.weights), settings.survival.max_keypoints)
-    survivals: list[Survival] = []
-    for sequence in sequences:
-        survivals += surviving_matches(sequence, frontend, gaps, settings.survival, tick)
-    labelled = read_labels(candidate.held_back) if any(record.state == DONE for record in records) else []
-    labelling = sum(record.seconds for record in records)
-    validation = Validation(
-        frames=sum(len(sequence) for sequence in sequences),
-        tracked=sum(record.tracked for record in records),
-        labels={name: sum(getattr(record, name) for record in records) for name in ("stable", "unstable", "ignore")},
-        agreeing={str(gap): [int(n) for s in survivals if s.gap == gap for n in s.agreeing] for gap in gaps},
-        share={str(gap): _share([s for s in survivals if s.gap == gap]) for gap in gaps},
-        pose=_pose_success(candidate, part, sequences, gaps, settings, progress),
-        failures=tuple(f"{record.name}: {record.reason}" for record in records if record.state != DONE),
-        seconds={"label": round(labelling, 1), "evaluate": round(time.perf_counter() - started, 1)},
-        **_of_labels(labelled),
-    )
-    write_validation(candidate.validation, validation)
-    return validation
+def _belongs_together(found: Validation) -> bool:
+    """Whether the numbers are finite, and every pair has its values."""
+    numbers = [found.track_length, found.stable_share, *found.truth.values()]
+    for scores in found.scores:
+        columns = list(scores.values.values())
+        numbers += [scores.seconds, *(value for column in columns for value in column)]
+        lengths = {len(scores.pairs), len(scores.matches), *map(len, columns)}
+        named = scores.values.keys() == found.scores[0].values.keys()
+        if len(lengths) > 1 or not scores.pairs or not named or any(len(pair) != 2 for pair in scores.pairs):
+            return False
+    return bool(found.scores) and bool(np.isfinite(numbers).all())
 
 
-def _opened(path: Path, part: Part) -> Sequence | None:
-    """The recording; None where it cannot be opened, which labelling has said already."""
-    try:
-        return open_sequence(path, part.sequence)
-    except InputError:
-        return None
+def _only(scores: PairScores, name: str) -> PairScores:
+    return PairScores(scores.gap, scores.pairs, scores.matches, {name: scores.values[name]})
 
 
-def _of_labels(labelled: list[LabeledSequence]) -> dict[str, float]:
-    """Track length, share of stable tracks and error over the label tables."""
-    observations = tracks = stable = with_label = 0
-    errors = []
-    for sequence in labelled:
-        points, rows = sequence.points, sequence.tracks
-        observations, tracks = observations + len(rows), tracks + len(points)
-        counts = points.counts()
-        stable, with_label = stable + counts["stable"], with_label + counts["stable"] + counts["unstable"]
-        chosen = np.isin(rows.track, points.track[points.stability != IGNORE]) & np.isfinite(rows.error)
-        errors.append(rows.error[chosen])
-    known = np.concatenate(errors) if errors else np.zeros(0)
-    return {
-        "track_length": observations / max(tracks, 1),
-        "stable_share": stable / max(with_label, 1),
-        "error": float(np.median(known)) if len(known) else float("nan"),
-    }
-
-
-def _share(survivals: list[Survival]) -> float:
-    keypoints = np.concatenate([s.keypoints for s in survivals]) if survivals else np.zeros(0)
-    agreeing = np.concatenate([s.agreeing for s in survivals]) if survivals else np.zeros(0)
-    return float((agreeing / np.maximum(keypoints, 1)).mean()) if len(keypoints) else 0.0
-
-
-def _pose_success(
-    candidate: Candidate,
-    part: Part,
-    sequences: list[Sequence],
-    gaps: tuple[int, ...],
-    settings: ValidationSettings,
-    progress: bool,
-) -> dict[str, float]:
-    """Success rates of the pose protocol over the recordings that have depth and true poses; empty without any."""
-    from improvo.evaluation.pose.results import results
-    from improvo.evaluation.pose.run import run_pose_protocol
-
-    survival = settings.survival
-    frontend = LoadedFrontend(str(candidate.weights), survival.max_keypoints, label=candidate.name)
-    workers = Workers(1, progress)
-    succeeded: defaultdict[str, float] = defaultdict(float)
-    pairs: Counter[str] = Counter()
-    for number, sequence in enumerate(sequences):
-        usable = _gaps_with_truth(sequence, gaps, survival.min_pairs)
-        if not usable:
-            continue
-        protocol = PoseSettings(usable, survival.pairs, max_keypoints=survival.max_keypoints, seed=survival.seed)
-        source = Recorded(str(sequence.path), part.sequence)
-        run = run_pose_protocol([source], [frontend], protocol, candidate.folder / "features" / str(number), workers)
-        for row in results(run)["rows"]:
-            for kind in ("rotation", "translation"):
-                name = f"{kind}, gap {row['gap']}, {row['estimator']}"
-                succeeded[name] += row["pairs"] * row[f"{kind}_success"]
-                pairs[name] += row["pairs"]
-    return {name: total / pairs[name] for name, total in succeeded.items()}
-
-
-def _gaps_with_truth(sequence: Sequence, gaps: tuple[int, ...], least: int) -> tuple[int, ...]:
-    """The gaps at which the sequence has at least so many pairs with depth and true poses."""
-
-    if sequence.ground_truth is None:
-        return ()
-    _, unusable = clean_truth(sequence.ground_truth)
-
-    def has_depth(row: int) -> bool:
-        depth = sequence.depth(row)
-        return depth is not None and bool(np.isfinite(depth).any())
-
-    def enough(gap: int) -> bool:
-        return len(draw_pairs(~unusable, has_depth, gap, least, np.random.default_rng(0))) == least
-
-    return tuple(gap for gap in gaps if enough(gap))
+def _range(values: Sequence[float]) -> str:
+    low, high = (f"{value:.3g}" for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"

@@ -149,7 +149,7 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a cluster started here reports to nobody
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     try:
-        if colon and port.isdigit():  # Ray itself would try for minutes, and end the process
+        if colon and port.isdecimal():  # Ray itself would try for minutes, and end the process
             socket.create_connection((host, int(port)), _PROBE_SECONDS).close()
         ray.init(address=address, runtime_env={"env_vars": ONE_THREAD}, log_to_driver=False, logging_level="ERROR")
     except (ConnectionError, ValueError, RuntimeError, OSError) as error:

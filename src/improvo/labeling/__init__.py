@@ -1,5 +1,6 @@
-"""Labels of many sequences: the labeller of one, the quality gate, the store, and the jobs that fill it.
+"""Labels of many recordings: run the odometry, apply the stability rule, check the quality, store the result.
 
-`labeler` makes labels of a recording, `quality` withholds those that are not to be trusted, `label_sequences` does it
-for many recordings into a `store`, `labeled` reads the store back, with the `frames` behind the labels.
+It imports `odometry`, `stability`, `sequences`, `frontend`, `geometry`, `jobs` and `untrusted`. The rule itself is in
+`stability/rule.py`. Open `labeler.py` first: labels of one recording. `quality` withholds doubtful labels,
+`label_sequences` labels many recordings into a `store`, and `labeled` reads the store back.
 """

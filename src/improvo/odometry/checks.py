@@ -65,7 +65,7 @@ def check_features(features: Features, width: int | None) -> None:
     if features.descriptors.ndim != 2 or (width is not None and features.descriptors.shape[1] != width):
         raise InputError(f"features: {shapes}, where the frame before had {width} columns; use one frontend throughout")
     if not (np.isfinite(features.keypoints).all() and np.isfinite(features.weights()).all()):
-        raise InputError("features: places or stabilities are NaN or infinite; mend the frontend")
+        raise InputError("features: keypoints or stabilities are NaN or infinite; correct the frontend")
 
 
 class OneThread:

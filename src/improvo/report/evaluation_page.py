@@ -1,4 +1,4 @@
-"""`report.html` of an evaluation: its tables as printed, its curves, and what the numbers mean."""
+"""`report.html` of an evaluation: its tables, its curves, and the meaning of the numbers."""
 
 from __future__ import annotations
 

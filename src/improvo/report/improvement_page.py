@@ -14,7 +14,7 @@ from improvo.report.page import Page, plain
 
 @dataclass(frozen=True)
 class Measure:
-    """A number that every round is judged by."""
+    """A measure that is compared over all rounds."""
 
     name: str  # with its unit, and the solver where one matters: "rotation < 5 degrees, gap 30, poselib"
     meaning: str
@@ -24,7 +24,7 @@ class Measure:
 
 @dataclass(frozen=True)
 class Round:
-    """One frontend and what is known of it; the first is the one before any improvement."""
+    """One frontend and its results; the first is the one before any improvement."""
 
     name: str
     values: dict[str, float] = field(default_factory=dict)  # by name of the measure
@@ -32,6 +32,7 @@ class Round:
     seconds: dict[str, float] = field(default_factory=dict)  # by stage: label, train, evaluate
     pictures: tuple[tuple[Path, str], ...] = ()  # PNG files with their captions
     losses: dict[str, list[float]] = field(default_factory=dict)  # of its training by name, and `step`
+    aside: bool = False  # a control, which no other round follows from
 
 
 def write_improvement_page(
@@ -43,6 +44,7 @@ def write_improvement_page(
     notes: Sequence[str] = (),
     best: int = -1,
     verdict: str = "",
+    gains: Sequence[Sequence[str]] = (),
 ) -> None:
     """Write the page.
 
@@ -55,6 +57,7 @@ def write_improvement_page(
         notes: what the reader should know, in plain words.
         best: the round that is held against the first.
         verdict: which round is kept, and why.
+        gains: a header and a row for each round after the first, gains over the first with their intervals.
     """
     first, last = rounds[0], rounds[best]
     page = Page(title, lead)
@@ -69,6 +72,9 @@ def write_improvement_page(
         page.paragraph(verdict)
     page.heading("What to look out for")
     page.warnings([*notes, *_setbacks(measures, first, last)], "Nothing: every measure is at least as good as before.")
+    if len(gains) > 1:
+        page.heading("Gain over the start")
+        page.table(list(gains[0]), [list(row) for row in gains[1:]], "With 95 % intervals over the same pairs.")
     page.heading("Before and after")
     page.table(
         ["", *(entry.name for entry in rounds)],
@@ -81,8 +87,9 @@ def write_improvement_page(
         for entry in (first, last) if last is not first else (first,):
             for picture, caption in entry.pictures[place : place + 1]:
                 page.picture(picture, f"{entry.name}: {caption}")
-    if len(rounds) > 2:
-        _curves(page, measures, rounds)
+    in_order = [entry for entry in rounds if not entry.aside]
+    if len(in_order) > 2:
+        _curves(page, measures, in_order)
     page.heading("Labels")
     names = list(dict.fromkeys(name for entry in rounds for name in entry.labels))
     page.table(

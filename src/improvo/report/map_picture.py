@@ -103,14 +103,17 @@ def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: in
 
 
 def trusted_points(sparse_map: SparseMap) -> NDArray[np.intp]:
-    """Rows of the points that are worth drawing: seen at least three times, and with an ordinary error."""
+    """Rows of the good points: at least three observations, and a mean error below 2 pixels."""
     good = (sparse_map.observations >= 3) & (sparse_map.mean_error < 2.0) & np.isfinite(sparse_map.xyz).all(axis=1)
     return np.flatnonzero(good)
 
 
 def _title(run: RunFolder, points: int, outside: int) -> str:
     frames, segments = run.report["frames"], run.report["segments"]
-    parts = [f"{frames['tracked']} of {frames['processed']} frames have a pose", f"{points} points"]
+    parts = [
+        f"{frames['tracked']} of {frames['processed']} frames have a pose",
+        f"{points} good points of {len(run.map)}",
+    ]
     if outside:
         parts.append(f"{outside} far ones outside the picture")
     if len(segments) > 1:
@@ -131,7 +134,7 @@ def _point_style(count: int) -> tuple[float, float]:
 
 
 def _time_bar(figure: object, axis: object, palette: Palette, frames: int, last: int) -> None:
-    """What the colours mean."""
+    """The colour bar."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 

@@ -1,4 +1,4 @@
-"""Which way is down, and what part of a map belongs in an overhead picture."""
+"""The vertical direction of a map, and the part of it that an overhead picture shows."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Overhead:
 
 
 def overhead_axes(world_from_cam: Float64) -> Overhead:
-    """The ground as the cameras (N, 4, 4) tell it, with the first camera's view upwards in the picture.
+    """The ground plane, found from the cameras (N, 4, 4); the first camera looks up in the picture.
 
-    People hold cameras level: the image's x axis stays horizontal however far the camera looks down, so down is what
-    is orthogonal to all x axes. Where the camera did not turn, the mean of the image's y axes decides what they leave
-    open.
+    People hold cameras level: the image's x axis stays horizontal even if the camera looks down. So the vertical
+    direction is orthogonal to all x axes. If the camera did not turn, the mean of the image's y axes decides between
+    the remaining directions.
     """
     x_axes, y_axes = world_from_cam[:, :3, 0], world_from_cam[:, :3, 1]
     spread = x_axes.T @ x_axes / len(x_axes)

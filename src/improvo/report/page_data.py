@@ -17,7 +17,7 @@ from improvo.report.palettes import Palette
 from improvo.stability.rule import IGNORE
 from improvo.types import Float64, UInt8
 
-_MAX_POINTS = 40_000  # of a layer; more make the page heavy, not the picture clearer
+_MAX_POINTS = 40_000  # points of a layer; more make the page larger but not clearer
 _JPEG_QUALITY = 55
 _NO_ERROR = 255
 _FLOW = 5  # frames behind each point
@@ -66,7 +66,7 @@ def frames_data(
 ) -> tuple[dict[str, Any], Float64]:
     """The frames of the slider with their tracks, and the mean brightness (N,) of each in grey values.
 
-    Frames that the recording no longer gives are left out.
+    Frames that can no longer be read from the recording are left out.
 
     Args:
         frames: which of the run's.
@@ -80,7 +80,7 @@ def frames_data(
     """
     import cv2
 
-    assert len(run.sequence) > 0  # opened here, so that a recording that is gone is an error and not no frames
+    assert len(run.sequence) > 0  # opened here, so that a missing recording raises an error instead of giving no frames
     shown, brightness = [], []
     for frame in frames:
         try:
@@ -121,7 +121,7 @@ def _packed_points(run: RunFolder, frame: int, old: int, large_error: float) -> 
     for earlier_frame in range(frame - 1, max(frame - _FLOW, 0) - 1, -1):
         rows = run.rows_of(earlier_frame, seen.track)
         earlier = run.tracks.keypoints[rows].astype(np.float64)
-        # a line across the picture, where a link jumps, says less than what lies after the jump alone
+        # where a link jumps, only the part after the jump is drawn
         followed &= (rows >= 0) & (np.linalg.norm(earlier - before, axis=1) < _JUMP_SHARE * run.camera.width)
         before[followed] = earlier[followed]
     packed["now"] = np.clip(np.round(seen.keypoints * 16), 0, 65535)

@@ -1,4 +1,4 @@
-"""What a user should know about a run, in plain words, from `run.json`."""
+"""Warnings about a run, in plain words, from `run.json`."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from improvo.types import Float64, Int64
 
-_DARK = 25.0  # mean grey value below which features become rare
+_DARK = 25.0  # mean grey value below which keypoints become rare
 
 
 def warnings(report: dict[str, Any], shown: Int64, brightness: Float64, median_error: float) -> list[str]:
-    """One line for each thing that is wrong or doubtful, the gravest first.
+    """One line for each problem or doubt, the most serious first.
 
     Args:
         report: the content of run.json.

@@ -50,8 +50,8 @@ def paint_stability(
     centres, radii = suppressed_regions(features.keypoints[low], image.shape[:2])
     canvas.rings(centres, radii, _PINK, thickness=2 * canvas.scale)
     return canvas.with_caption(
-        f"{name}: {int((~low).sum())} stable keypoints (white), {int(low.sum())} suppressed (black; circles: "
-        f"{len(centres)} regions with most)",
+        f"{name}: {int((~low).sum())} stable keypoints (white), {int(low.sum())} suppressed (black), "
+        f"circled: {len(centres)}",
         (palette.ramp_strip(), "stable", "unstable"),
     )
 

@@ -13,7 +13,7 @@ from improvo.report.palettes import PALETTES, Palette
 from improvo.stability.rule import IGNORE, STABLE, UNSTABLE
 from improvo.types import Float32, Int64, UInt8
 
-_JUMP_SHARE = 0.03  # of the image width; shorter links are never called a jump
+_JUMP_SHARE = 0.03  # share of the image width; shorter links never count as a jump
 
 FramePainter = Callable[[RunFolder, int], UInt8]  # (run, frame) -> RGB picture
 
@@ -23,7 +23,7 @@ class TrackPictureSettings:
     """How tracks are drawn."""
 
     tail: int = 8  # frames of flow behind each point
-    min_age: int = 3  # frames; the flow of younger tracks, half of them chance, would hide the picture
+    min_age: int = 3  # frames; younger tracks, half of them wrong matches, are drawn as dots
     old: int = 30  # frames; tracks of this age and more have the last colour
     large_error: float = 3.0  # pixels; residuals of this size and more have the last colour
     palette: Palette = PALETTES["paper"]
@@ -43,8 +43,8 @@ def paint_tracks(run: RunFolder, frame: int, settings: TrackPictureSettings | No
     canvas.dots(seen.keypoints[grown], colours[grown], 1.7)
     median = np.median(seen.age[grown]) if len(grown) else 0
     return canvas.with_caption(
-        f"frame {frame}: {len(grown)} tracks of {settings.min_age}+ frames with their last {settings.tail} frames "
-        f"of flow, {len(young)} younger (dots); median age {median:.0f}; jumps are faint",
+        f"frame {frame}: {len(grown)} tracks of {settings.min_age}+ frames, {len(young)} younger (dots); "
+        f"median age {median:.0f}",
         (settings.palette.ramp_strip(), "new", f"{settings.old}+ frames"),
     )
 
@@ -87,7 +87,7 @@ def paint_labels(run: RunFolder, frame: int, settings: TrackPictureSettings | No
 def _draw_tails(canvas: Canvas, run: RunFolder, frame: int, tail: int, tracks: Int64, colours: UInt8) -> None:
     """The flow of the given tracks through the last `tail` frames; links that jump are drawn faintly.
 
-    The tracks are raw: a link to something else stays in them, and would otherwise be all that one sees.
+    Raw tracks contain wrong matches. Drawn at full strength, their long lines would hide everything else.
     """
     links: list[tuple[Float32, Float32, UInt8]] = []
     keypoints = run.tracks.keypoints

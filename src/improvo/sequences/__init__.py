@@ -1,7 +1,8 @@
-"""Frames in, from every format, and the writers that mirror them.
+"""Recordings of every format in, `Frame`s out: grey, undistorted, resized, with times, depth and ground truth.
 
-`open_sequence(path)` recognises a recording and delivers grey, undistorted, resized frames with times, depth and
-ground truth. A new format costs one file with one `Recording`, and one row in `opening.FORMATS`.
+It imports `geometry` and `untrusted`. Open `base.py` first: `Recording`, the interface of a format. `opening.py`
+recognises a path; its table `FORMATS` lists all formats. A new format is one file with a subclass of `Recording`, and
+one row in that table; `seven_scenes.py` is a short one to copy.
 """
 
 from __future__ import annotations

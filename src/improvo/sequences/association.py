@@ -1,4 +1,4 @@
-"""Which row of one clock belongs to which of another."""
+"""Rows of two lists of time stamps that belong together."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from improvo.geometry.se3 import rigid
 from improvo.types import Float64, Int64, Trajectory
 
-SAME_TIME = 1e-4  # seconds; stamps this near are one instant written with fewer digits
+SAME_TIME = 1e-4  # seconds; stamps this close are the same time, rounded
 MAX_DIFFERENCE = 0.02  # seconds; TUM's associate.py
 MAX_GAP = 0.1  # seconds between two poses that may be interpolated
 
@@ -25,10 +25,10 @@ def nearest(times: Float64, other: Float64, max_difference: float = MAX_DIFFEREN
 
 
 def poses_at(trajectory: Trajectory, times: Float64) -> Trajectory:
-    """The trajectory at these times: the row of the same instant, else between its neighbours, else NaN.
+    """The trajectory at these times: the row of the same time, else interpolated, else NaN.
 
-    Neighbours up to `MAX_GAP` apart are interpolated (slerp and straight lines); beyond that the nearest row counts
-    if it is within `MAX_DIFFERENCE`.
+    Neighbours up to `MAX_GAP` apart are interpolated (slerp and straight lines); if they are farther apart, the nearest
+    row is used if it is within `MAX_DIFFERENCE`.
     """
     known = np.flatnonzero(trajectory.valid)
     stamps, poses = trajectory.times[known], trajectory.world_from_cam[known]

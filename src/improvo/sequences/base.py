@@ -1,4 +1,4 @@
-"""What a recording is: one capture as it lies on disk, before undistortion, stride and resize."""
+"""The interface of a format: one recording as stored on disk, before undistortion, stride and resize."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ class SequenceSettings:
 
     format: str = "auto"
     camera: str | None = None  # a calibration file, or "fx,fy,cx,cy[,k1,k2,p1,p2,k3]"
-    fov: float | None = None  # horizontal field of view in degrees, where nothing better is known
+    fov: float | None = None  # horizontal field of view in degrees, if there is no calibration
     fps: float | None = None  # frame rate of recordings without time stamps
     start: int = 0  # first frame of the recording
     end: int | None = None  # one past the last frame of the recording
     stride: int = 1  # every n-th frame
     max_frames: int | None = None  # after the stride
-    undistorted_fov: float | None = None  # degrees of a wide lens that are seen; None keeps the middle's resolution
+    undistorted_fov: float | None = None  # degrees of a wide lens to show; None keeps the centre's resolution
     width: int | None = None  # resize to this width, keeping the aspect ratio
-    mask: str | None = None  # an image for all frames, or a folder with one for each; white is used, black is not
+    mask: str | None = None  # one image for all frames, or a folder with one per frame; only white pixels are used
     topic: str | None = None  # the image topic of a ROS bag, or the camera of a recording with several (cam1, image_3)
 
 
 class Recording(ABC):
-    """One recording as it lies on disk, by random access; a format is one file with one subclass.
+    """One recording as stored on disk, with random access. A format is one file with one subclass.
 
-    The constructor finds out what there is (times, calibration, ground truth) without decoding images. It raises
-    `InputError` where the recording as a whole cannot be used, and adds a line to `notes` for what a user should know.
+    The constructor reads times, calibration and ground truth without decoding images. It raises `InputError` if the
+    recording as a whole cannot be used, and adds a line to `notes` for what a user should know.
     """
 
     format: ClassVar[str]  # as in --format
@@ -49,9 +49,9 @@ class Recording(ABC):
     path: Path
     times: Float64  # (N,) seconds, strictly increasing
     calibration: Calibration | None = None  # of the raw images, with distortion; None where the format has none
-    calibration_error: InputError | None = None  # why the calibration that lies in it cannot be used
+    calibration_error: InputError | None = None  # why the recording's own calibration cannot be used
     ground_truth: Trajectory | None = None  # camera-to-world, rows at their own time stamps
-    notes: tuple[str, ...] = ()  # what was odd but could be handled, one line each
+    notes: tuple[str, ...] = ()  # oddities that could be handled, one line each
 
     @abstractmethod
     def __init__(self, path: Path, settings: SequenceSettings) -> None: ...
@@ -79,7 +79,7 @@ class Recording(ABC):
     def own_calibration(self, *sources: Callable[[], Calibration | None]) -> Calibration | None:
         """The calibration of the first of these that has one.
 
-        An error is kept, not raised: who gives his own camera does not need this one. `Sequence` raises it where it is
+        An error is kept, not raised, because the user may give another camera. `Sequence` raises it if this one is
         needed.
         """
         for source in sources:

@@ -1,7 +1,7 @@
 """EuRoC MAV, the ASL layout (Burri et al. 2016): `mav0/cam0/data.csv`, `sensor.yaml`, nanosecond stamps.
 
-Ground truth is that of a body sensor (`state_groundtruth_estimate0`, else `vicon0` or TUM-VI's `mocap0`); the `T_BS` of
-the sensors carry it to the camera. `--topic cam1` chooses another camera. TUM-VI has `dso/camchain.yaml`.
+Ground truth is that of a body sensor (`state_groundtruth_estimate0`, else `vicon0` or TUM-VI's `mocap0`), converted to
+camera poses with the `T_BS` of the sensors. `--topic cam1` chooses another camera. TUM-VI has `dso/camchain.yaml`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class EurocMav(Recording):
         self.notes = tuple(notes)
 
     def _place(self, read: Callable[[], Float64]) -> Float64 | None:
-        """Where the camera is on the body; None, and no ground truth, where the file is broken."""
+        """Pose of the camera on the body; None if the file is broken, and then there is no ground truth."""
         try:
             return read()
         except InputError as error:

@@ -1,8 +1,8 @@
 """Pictures of more than 8 bits as 8 bits, the same way in every frame of a recording.
 
-Cameras put 10, 12 or 14 bits into 16-bit files, and thermal cameras counts that fill a small part of them: their upper
-eight bits show little or nothing. The range that a recording uses is then stretched to 8 bits. It is fixed for the
-recording: a range for each frame would make points flicker.
+Cameras store 10, 12 or 14 bits in 16-bit files, and thermal cameras use only a small part of the range, so the upper
+eight bits show little or nothing. The range that a recording uses is stretched to 8 bits. It is the same for all
+frames, because points would flicker otherwise.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The image files of one recording, read all in the same way: grey levels, and the rotation that cameras note."""
+"""The image files of one recording, all read in the same way: the same grey levels and the same EXIF rotation."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _PLAIN = 1  # the orientation of a picture that is stored as it is seen
 class ImageFiles:
     """Files by their number. `notes` say what was done to their grey levels and orientation.
 
-    A rotation that all pictures note (a phone held upright) is applied. Where it changes within a recording, none is:
-    the camera's own calibration holds for the pictures as the sensor made them.
+    An EXIF rotation that all pictures share (a phone held upright) is applied. If it changes within a recording, none
+    is applied, because the calibration holds for the unrotated pictures.
     """
 
     def __init__(self, files: Iterable[Path], where: Path) -> None:

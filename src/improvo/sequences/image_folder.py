@@ -84,7 +84,7 @@ class ImageFolder(Recording):
 
 
 def _image_folder(path: Path) -> Path | None:
-    """The folder itself, or its `images` folder where that has more of them (a `vignette.png` lies above it)."""
+    """The folder itself, or its `images` folder if that has more images (there may be a `vignette.png` beside it)."""
     if not path.is_dir():
         return None
     found = [(folder, len(list_images(folder))) for folder in (path, *_subfolders(path))]
@@ -102,7 +102,7 @@ def _subfolders(path: Path) -> list[Path]:
 
 
 def _is_images_of(path: Path) -> bool:
-    """Whether this is the `images` folder of a recording that was named by its inside."""
+    """Whether this is the `images` folder inside a recording's folder."""
     return path.name in _SUBFOLDERS
 
 

@@ -1,4 +1,4 @@
-"""Which of the files in a folder are the pictures: masks, depth and the other eye often lie beside them."""
+"""Chooses the pictures among the files of a folder: masks, depth and the second stereo camera are often beside them."""
 
 from __future__ import annotations
 

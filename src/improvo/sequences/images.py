@@ -1,4 +1,4 @@
-"""Encoded images: decoded whole, or refused."""
+"""Encoded images: decoded completely, or refused."""
 
 from __future__ import annotations
 

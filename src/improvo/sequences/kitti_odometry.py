@@ -1,7 +1,7 @@
 """KITTI odometry (Geiger et al. 2012): `calib.txt`, `times.txt`, `image_0` (grey) or `image_2` (colour), poses.
 
-Poses are those of camera 0: `poses.txt` in the folder, or `poses/NN.txt` beside the `sequences` folder. Images of
-another camera get its place from the projection matrix, which is K [I | t].
+Poses are those of camera 0: `poses.txt` in the folder, or `poses/NN.txt` beside the `sequences` folder. The pose of
+another camera follows from its projection matrix, which is K [I | t].
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A drive of KITTI's raw data (Geiger et al. 2013): `image_02/data`, `timestamps.txt`, `oxts`, calibration of the day.
 
 The calibration files lie in the folder of the day, above the drive. Pictures of a `_sync` drive are rectified, those of
-an `_extract` drive are not; their size tells which. Ground truth is that of the GPS and inertial unit, carried to the
-camera; its world is a Mercator map, east, north and up in metres.
+an `_extract` drive are not; their size tells which. Ground truth is that of the GPS and inertial unit, converted to
+camera poses; its world is a Mercator map, east, north and up in metres.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class KittiRaw(Recording):
         times = np.arange(len(files)) / (settings.fps or FPS)
         if stamps_file.is_file() and settings.fps is None:
             times, _ = read_times(stamps_file)
-            # a lost picture leaves its stamp: files are numbered by their row
-            rows = np.array([int(file.stem) if file.stem.isdigit() else len(times) for file in files])
+            # a lost picture still has a time stamp, so files are numbered by row
+            rows = np.array([len(times) if number_of(file.stem) is None else number_of(file.stem) for file in files])
             if (rows >= len(times)).any():
                 raise InputError(
                     f"{stamps_file}: has {len(times)} times for {len(files)} images; repair it or give --fps"

@@ -1,7 +1,7 @@
 """Webcams (`0`, `1`, ...) and network streams (`rtsp://`, `http://`, ...), live: always the latest frame.
 
-A thread keeps the newest frame; what the reader was too slow for is dropped and counted. A live recording has no
-length, no random access and no ground truth.
+A thread keeps the newest frame; frames that the reader was too slow for are dropped and counted. A live recording has
+no length, no random access and no ground truth.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Masks: which pixels of the frames are used. White is used; what is black never has a keypoint.
+"""Masks of frames: keypoints lie on white pixels only, never on black ones.
 
-A mask has the size of the recording's own images and goes the way that they go: undistorted, cropped, resized. A
-descriptor sees some pixels around its keypoint, so a border around black areas counts as black.
+A mask has the size of the recording's own images, and is undistorted, cropped and resized like them. A descriptor uses
+some pixels around its keypoint, so a border around black areas counts as black too.
 """
 
 from __future__ import annotations
@@ -91,10 +91,10 @@ class SequenceMasks:
 
 def delivered_mask(raw: UInt8, rectifier: Rectifier) -> Mask:
     """(H, W) of the delivered frame: white pixels of the raw mask, without the border around black ones."""
-    # every raw pixel that has a part in a delivered one must be white
+    # every raw pixel that contributes to a delivered one must be white
     white = rectifier.image(np.where(raw >= _WHITE, np.uint8(255), np.uint8(0))) == 255
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BORDER + 1, 2 * BORDER + 1))
-    return np.asarray(cv2.erode(white.astype(np.uint8), disc), np.bool_)  # beyond the picture nothing is black
+    return np.asarray(cv2.erode(white.astype(np.uint8), disc), np.bool_)  # outside the picture nothing counts as black
 
 
 def size_of(file: Path) -> tuple[int, int] | None:
@@ -116,7 +116,7 @@ def _image(file: Path) -> UInt8:
 
 
 def _chosen(path: Path, name: str) -> Path:
-    """What of the path belongs to the recording."""
+    """The part of the path that belongs to the recording."""
     if not path.exists():
         raise InputError(f"--mask {path}: no such file or folder; `improvo info SEQUENCE --write-mask FILE` makes one")
     if not path.is_dir():

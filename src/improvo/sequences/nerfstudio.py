@@ -1,7 +1,8 @@
 """Nerfstudio's and instant-ngp's `transforms.json`: images with intrinsics and OpenGL camera poses.
 
-Frames are in the order of their file names' numbers. Principal points count from the corner of the pixel, as in COLMAP,
-and are moved by half a pixel. Depth images are 16 bit, in units of `depth_unit_scale_factor` metres (default 0.001).
+Frames are in the order of their file names' numbers. Principal points are measured from the corner of the top-left
+pixel, as in COLMAP; they are moved by half a pixel. Depth images are 16 bit, in units of `depth_unit_scale_factor`
+metres (default 0.001).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`open_sequence`: which format a path is, and the sequence it makes."""
+"""`open_sequence`: recognises the format of a path and opens it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from improvo.untrusted.paths import check_path
 
 ENTRY_POINT = "improvo.recordings"  # the group under which other packages offer their readers
 
-# format -> class; the most telling layouts first, the plain image folder last
+# format -> class; tried in this order: the most specific layouts first, the plain image folder last
 FORMATS: dict[str, str] = {
     "live": "improvo.sequences.live:LiveStream",
     "sens": "improvo.sequences.scannet_sens:ScanNetSens",

@@ -1,4 +1,4 @@
-"""The numbers that a calibration file keeps beside the camera: the frame rate, and the scale of depth."""
+"""Two further numbers of a calibration file: the frame rate, and the scale of depth."""
 
 from __future__ import annotations
 

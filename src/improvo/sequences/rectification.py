@@ -1,4 +1,4 @@
-"""From raw images to the pinhole view that is delivered: undistorted once, then resized; depth goes the same way."""
+"""From raw images to the delivered pinhole view: undistorted once, then resized; depth too."""
 
 from __future__ import annotations
 
@@ -20,9 +20,8 @@ class Rectifier:
     """Carries raw images and depth of one camera to a pinhole camera of the same or another width.
 
     A distorted camera gets the widest pinhole view of the raw size, pixel shape and principal point that shows no
-    border: its focal lengths are the raw ones times `zoom`. A pinhole that is wider than `MAX_FOV` would shrink its
-    middle to nothing, so beyond that the view keeps the focal length of the middle. What it leaves out is said by
-    `description`.
+    border: its focal lengths are the raw ones times `zoom`. A pinhole view wider than `MAX_FOV` would shrink its centre
+    too much; such a view keeps the focal length of the centre instead. `description` says what part is left out.
 
     Args:
         raw: the camera of the recording's images.
@@ -133,7 +132,7 @@ def _inside(raw: Camera, zoom: float, border: Float64) -> bool:
     view = replace(raw.pinhole(), fx=raw.fx * zoom, fy=raw.fy * zoom)
     pixels = _distort_pixels(raw, view, border)
     rays = view.unproject(border)[:, :2]
-    # a ray a little further out must land further out: beyond that the polynomial is no camera any more
+    # a ray further out must project further out; beyond that the polynomial is not valid
     further = raw.distort(rays * 1.001)
     here = raw.distort(rays)
     grows = (further**2).sum(axis=1) >= (here**2).sum(axis=1)

@@ -1,4 +1,4 @@
-"""Depth of one camera as the depth of another: what a colour pixel sees."""
+"""Depth of the depth camera, registered to the colour camera."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from improvo.types import Float32, Float64
 def register_depth(depth: Float32, depth_camera: Camera, camera: Camera, cam_from_depth: Float64) -> Float32:
     """Depth (h, w) of the pinhole `depth_camera` as depth (H, W) in metres of the pinhole `camera`, NaN where unseen.
 
-    With both in one place each pixel looks up its own ray; otherwise points are carried over, the nearest wins, and
-    each covers as many pixels as its own pixel does in the other camera.
+    If both cameras are at the same position, each pixel looks up its own ray. Otherwise each point is projected and
+    covers as many pixels as its own pixel has in the other camera; the nearest point wins.
     """
     if np.allclose(cam_from_depth, np.eye(4), atol=1e-6):
         x, y = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))

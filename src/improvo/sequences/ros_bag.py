@@ -1,8 +1,8 @@
 """ROS 1 and ROS 2 bags, through the `rosbags` package (extra `ros`): Image, CompressedImage, CameraInfo, poses.
 
-The image topic is the one with pictures, or `--topic`; its CameraInfo is the one beside it. Times are the messages'
-header stamps (the bag's own where headers have none). Where a few samples show that both are the same, the index of
-the bag gives them all and opening reads no images; otherwise the headers are read once.
+The image topic is the one with pictures, or `--topic`; its CameraInfo is the one beside it. Times are the header stamps
+of the messages (the bag's own if headers have none). If a few samples show that both agree, the times are read from the
+index of the bag, without reading images; otherwise all headers are read once.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class RosBag(Recording):
     def _associate_depth(self, depths: list[Stream]) -> tuple[Stream | None, Int64, list[str]]:
         """The depth stream of the images' camera and its row for each image.
 
-        Depth of another camera would have to be carried over by a transform that a bag need not hold; it is left out.
+        Depth of another camera is left out, because the bag may not contain the transform between the two.
         """
         depths = sorted(depths, key=lambda stream: ("aligned" not in stream.topic, "regist" not in stream.topic))
         stream = depths[0]

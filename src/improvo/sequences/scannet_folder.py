@@ -55,7 +55,9 @@ class ScanNetFolder(Recording):
             stems = [file.stem for file in files]
             self._depth = [path / "depth" / f"{stem}.png" for stem in stems]
             poses_files = [path / "pose" / f"{stem}.txt" for stem in stems]
-            numbers = np.array([int(stem) if stem.isdigit() else row for row, stem in enumerate(stems)], np.float64)
+            numbers = np.array(
+                [row if number_of(stem) is None else number_of(stem) for row, stem in enumerate(stems)], np.float64
+            )
         published = self.calibration
         self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: published)
         if self.calibration is not None:

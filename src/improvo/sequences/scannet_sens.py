@@ -1,8 +1,8 @@
 """ScanNet `.sens` (Dai et al. 2017): one file of compressed colour and depth frames with poses, read by seeking.
 
-Opening hops from frame header to frame header, so it costs no decoding and memory for the headers only. Written from
-the published description of the format (version 4). Depth is carried to the colour camera by the two intrinsics and
-extrinsics. Time stamps are microseconds; where they do not increase, 30 frames per second are assumed.
+Opening reads only the frame headers and decodes nothing. Written from the published description of the format (version
+4). Depth is registered to the colour camera with the intrinsics and extrinsics of both. Time stamps are microseconds;
+where they do not increase, 30 frames per second are assumed.
 """
 
 from __future__ import annotations

@@ -218,7 +218,7 @@ def selected(recording: Recording, settings: SequenceSettings) -> Int64:
 
 
 def _calibration(recording: Recording, settings: SequenceSettings, width: int, height: int) -> Calibration:
-    """What the user gave, else what the recording has, else the field of view."""
+    """The user's calibration, else the recording's, else one from the field of view."""
     if settings.camera is not None:
         return load_calibration(settings.camera)
     if settings.fov is not None:

@@ -1,8 +1,8 @@
-"""Pixels that never change while the rest of the picture does: overlays, letterbox bars, what carries the camera.
+"""Pixels that never change while the rest of the picture does: overlays, letterbox bars, the vehicle with the camera.
 
-What stands still is told by its gradient, not by its brightness: that of a bonnet changes with the light, and that of a
-white ceiling never. The gradients of what moves past a pixel point anywhere and cancel out; those of an overlay add up
-and have the same length in every picture.
+Such pixels are found by their gradient, not by their brightness: the brightness of a bonnet changes with the light, and
+that of a white ceiling never changes even if the camera moves. Gradients of moving content point in all directions and
+cancel out. Those of an overlay add up and have the same length in every picture.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class StillPixels:
         self._count += 1
 
     def share(self, used: Mask | None = None) -> float:
-        """The share of the picture; 0 where too few pictures were seen, or where nothing moves anyway.
+        """The share of the picture; 0 if there were too few pictures, or if hardly anything in them moves.
 
         Args:
             used: (H, W) what is not masked already.
@@ -111,7 +111,7 @@ def still_mask(recording: Recording, indices: Int64, samples: int) -> UInt8:
 
 
 def _closed(mask: Mask) -> Mask:
-    """With gaps of a few pixels filled; what lies beyond the picture is no gap."""
+    """With gaps of a few pixels filled; the outside of the picture is not a gap."""
     padded = cv2.copyMakeBorder(mask.astype(np.uint8), _GAP, _GAP, _GAP, _GAP, cv2.BORDER_CONSTANT, value=0)
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((_GAP, _GAP), np.uint8))
     return np.asarray(closed[_GAP:-_GAP, _GAP:-_GAP] > 0)

@@ -19,7 +19,7 @@ from improvo.sequences.survey_pictures import measure
 
 PLACEHOLDER_FOV = 60.0
 GAP_STEPS = 2.5  # median time steps
-RATES = (0.05, 1000.0)  # frames per second outside of which time stamps are hardly seconds
+RATES = (0.05, 1000.0)  # frames per second; outside this range time stamps are probably not in seconds
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def survey(
         recording.close()
         raise InputError(f"{path}: is live, so there is nothing to look at yet; record it first")
     if settings.camera is not None:
-        load_calibration(settings.camera)  # what the user gives himself must be right
+        load_calibration(settings.camera)  # a calibration given by the user must be correct
     problems: list[Problem] = []
     calibrated = True
     try:

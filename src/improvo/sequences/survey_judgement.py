@@ -1,4 +1,4 @@
-"""What in a recording will hurt, and what to do about it."""
+"""Problems of a recording, and what to do about them."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _ASPECT = 1.15  # between fx and fy
 
 @dataclass(frozen=True)
 class Problem:
-    """Something to mend, and how."""
+    """A problem, and what to do about it."""
 
     what: str
     advice: str
 
 
 def camera_problems(sequence: Sequence) -> list[Problem]:
-    """What about the camera is possible, and not plausible."""
+    """Camera parameters that are possible but not plausible."""
     raw = sequence.raw_camera
     mend = "compare the calibration with the pictures: is it of this camera, at this size and zoom?"
     found = []
@@ -48,7 +48,7 @@ def camera_problems(sequence: Sequence) -> list[Problem]:
 
 
 def picture_problems(facts: dict[str, Any]) -> list[Problem]:
-    """What in the sampled pictures will hurt, the worst first."""
+    """Problems in the sampled pictures, the worst first."""
     found = []
     if facts["unreadable"]:
         found.append(
@@ -90,7 +90,7 @@ def picture_problems(facts: dict[str, Any]) -> list[Problem]:
             )
         )
     if facts["corners"] == 0 and found:
-        return found  # whatever else is measured in pictures without anything to see says nothing
+        return found  # in pictures without content, the other measurements mean nothing
     if facts["blurred"] > 0.15:
         found.append(
             Problem(

@@ -1,4 +1,4 @@
-"""What a video file is, from its first bytes: no video at all, or a codec that cannot be decoded; and the mend."""
+"""Why a video cannot be read, from its first bytes (no video, or an unsupported codec), and what to do."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _MATROSKA = re.compile(rb"V_[A-Z0-9]+(?:/[A-Z0-9]+)*")
 
 
 def why_unreadable(path: Path) -> str:
-    """What is wrong with a video that cannot be opened, and the mend."""
+    """Why a video cannot be opened, and what to do."""
     codec = video_codec(path)
     if codec is not None:
         return (

@@ -116,7 +116,7 @@ class VideoFile(Recording):
         self._close()
 
     def _grab(self) -> bool:
-        """Decode one frame further; `_position` is then the frame that its time stamp says."""
+        """Decode the next frame; `_position` is then its number, found by its time stamp."""
         capture = self._opened()
         self._image = None
         if not capture.grab():
@@ -148,8 +148,8 @@ class VideoFile(Recording):
 def _index(path: Path) -> tuple[Int64, Int64]:
     """Time stamps of all frames in microseconds, increasing, and which of them are key frames that can be sought.
 
-    Where the packets' stamps are not those of the decoded frames (AVI with B-frames, MPEG-1), everything is decoded
-    once, frames are then known by counting, and there are no key frames.
+    If the packets' stamps are not those of the decoded frames (AVI with B-frames, MPEG-1), the whole file is decoded
+    once. Frames are then identified by counting, and there are no key frames.
     """
     packets = cv2.VideoCapture(_name(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
     stamps, is_key = [], []

@@ -1,4 +1,7 @@
-"""Simulated rooms with exact ground truth, and the small sequence that ships with improvo."""
+"""Simulated rooms with exact depth, poses and causes of instability, and the small recording that ships with improvo.
+
+It imports `geometry`. Open `generate.py` first: a recording from its settings. `scene.py` puts one room together.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Collects materials, shapes, lights and joints into a MuJoCo model (MJCF), and remembers what each geom is."""
+"""Builds a MuJoCo model (MJCF) from materials, shapes, lights and joints, and records what each geom is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The true cause of instability of every pixel, from what the renderer knows."""
+"""The true cause of instability of every pixel, computed by the renderer."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from improvo.types import Float32, Float64, Int64, UInt8
 class Cause(IntEnum):
     """Values of the label images. Where several apply, the first of this order wins: 1, 2, 4, 3, 5, 0."""
 
-    STATIC = 0  # nothing speaks against this pixel
+    STATIC = 0  # none of the causes below
     MOVING = 1  # an object that moves
-    HIGHLIGHT = 2  # structure made by specular light, which goes with the viewer
+    HIGHLIGHT = 2  # structure made by specular light, which moves with the viewer
     SHADOW_EDGE = 3  # the edge of a cast shadow that moves
     DEPTH_DISCONTINUITY = 4  # a jump of depth: the place of t-junctions
     REPEATED_TEXTURE = 5  # a point that looks like its neighbours
@@ -24,8 +24,8 @@ class Cause(IntEnum):
 
 _HIGHLIGHT = 12.0  # grey levels that specular light adds
 _SHADOW_STEP = 0.1  # step of the share of light that arrives
-_SHADOW_CHANGE = 5.0  # grey levels that change while nothing but light moves
-_SHADOW_DELAY = 0.15  # seconds over which that is seen
+_SHADOW_CHANGE = 5.0  # grey levels by which a moving light changes the picture
+_SHADOW_DELAY = 0.15  # seconds between the two pictures compared for that
 _DEPTH_STEP = 0.04  # second difference of inverse depth, relative; 0 on planes
 
 
@@ -55,7 +55,7 @@ def cause_image(
 
 
 def _highlights(image: UInt8, matt: UInt8) -> np.ndarray:
-    """Where specular light is bright, and the picture's structure is more its than the surface's."""
+    """Where specular light is bright and contributes more structure than the surface."""
     added = np.clip(image.astype(np.int16) - matt, 0, 255).max(axis=2).astype(np.uint8)
     kernel = np.ones((5, 5), np.uint8)
     of_light = cv2.morphologyEx(added, cv2.MORPH_GRADIENT, kernel)

@@ -1,4 +1,4 @@
-"""What moves by itself: people who walk, balls that roll, a lamp that swings, a drawer that opens."""
+"""Moving objects: people who walk, balls that roll, a lamp that swings, a drawer that opens."""
 
 from __future__ import annotations
 

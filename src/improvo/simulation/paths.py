@@ -1,4 +1,4 @@
-"""Smooth paths over the floor, and the path of a camera in somebody's hand."""
+"""Smooth paths over the floor, and the path of a hand-held camera."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class CameraPath:
         return rigid(level @ so3_exp(turn), position)
 
     def _look_around(self, rng: np.random.Generator, floor: Floor, knots: Float64) -> Float64:
-        """Yaw at the knots: each looks across the room, and no further round than the settings allow."""
+        """Yaw at the knots: each looks across the room, turned no further than the settings allow."""
         most = np.radians(self._settings.turn) * 2.5
         yaw = [float(np.arctan2(*-self.path.position(float(knots[0]))[::-1]))]
         half = np.array([floor.width, floor.length]) / 2

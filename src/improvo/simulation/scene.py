@@ -50,7 +50,7 @@ def build_scene(settings: SimulationSettings) -> Scene:
 def _apart(
     rng: np.random.Generator, floor: Floor, camera: CameraPath, settings: SimulationSettings, speed: float
 ) -> FloorPath:
-    """A path on which a mover never comes too near to the camera, and is seen now and then."""
+    """A path on which a moving object keeps away from the camera, but is sometimes in view."""
     times = np.arange(0, settings.frames / settings.fps, 0.2)
     poses = camera.world_from_cam(times)
     here, forward = poses[:, :2, 3], poses[:, :2, 2]

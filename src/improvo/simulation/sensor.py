@@ -1,4 +1,4 @@
-"""What a real camera does to a perfect picture: motion blur, rolling shutter, vignetting, exposure, noise."""
+"""Effects of a real camera: motion blur, rolling shutter, vignetting, exposure, noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a simulated recording is made of: one dataclass, and the presets `easy`, `home` and `crowded`."""
+"""Settings of a simulated recording: one dataclass, and the presets `easy`, `home` and `crowded`."""
 
 from __future__ import annotations
 

@@ -21,8 +21,8 @@ DEPTH_SCALE = 5000.0  # depth value of one metre
 class TumRgbdWriter:
     """Writes a sequence in TUM RGB-D layout, frame by frame.
 
-    Every image is written whole or not at all, and the lists when the writer is closed, also by an exception or
-    Ctrl-C: what then lies there is a valid, shorter sequence.
+    Every image is written completely or not at all. The lists are written when the writer is closed, also after an
+    exception or Ctrl-C, so the folder is then a valid, shorter sequence.
 
     ::
 

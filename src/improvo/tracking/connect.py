@@ -10,8 +10,8 @@ from improvo.types import Int64
 class TrackChain:
     """Gives every keypoint of every frame its track id.
 
-    A keypoint that matches one of the frame before belongs to that one's track; any other begins a new track. Ids rise
-    and are never used again, so a track that is interrupted goes on under another id.
+    A keypoint that matches a keypoint of the previous frame continues its track; any other begins a new track. Ids
+    increase and are never reused, so an interrupted track continues under a new id.
     """
 
     def __init__(self) -> None:

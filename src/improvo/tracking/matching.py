@@ -1,7 +1,7 @@
 """Mutual nearest neighbours (paper, "Point Tracks").
 
-Every descriptor becomes a unit vector, so that one product of matrices serves all: bits b of a binary descriptor
-become (2b - 1) / sqrt(number of bits), for which the squared distance is 4 x (share of differing bits).
+Every descriptor becomes a unit vector, so one matrix product gives all distances. Bits b of a binary descriptor become
+(2b - 1) / sqrt(number of bits), for which the squared distance is 4 x (share of differing bits).
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ def unit_descriptors(features: Features) -> Float32:
 def distance_threshold(features: Features, max_distance: float) -> float:
     """The paper's threshold tau on unit descriptors, or its equivalent share of differing bits as a distance.
 
-    tau = 0.7 admits 0.7 / 1.41 of the distance between unrelated float descriptors; binary ones are admitted up to the
-    same share of the Hamming distance between unrelated ones: 63 of 256 bits.
+    tau = 0.7 is 0.7 / 1.41 of the distance between unrelated float descriptors. For binary descriptors the same share
+    of the Hamming distance between unrelated ones is used: 63 of 256 bits.
     """
     if not features.binary:
         return max_distance

@@ -93,12 +93,17 @@ class DevicePairs:
         plan = self._plan(rng, len(self.process.part_of(settings.optimiser.batch_size)))
         shown = self.store.views(plan.rows.T.ravel(), plan.view_from_picture, views.width, views.height)
         images = augment_batch(shown, rng, generator, settings.photometric)
-        network_input = (images.float() / 255).contiguous(memory_format=torch.channels_last)
-        logits = self.detector(network_input)
-        batch = {"images": images, "detector": logits, "scenes": on_device(plan.scenes, self.device)}
-        if self.stability is not None:
-            batch["stability"] = self.stability(network_input[:: settings.stability_every])
+        batch = {"images": images, "scenes": on_device(plan.scenes, self.device), **self.taught(images)}
+        logits = batch["detector"]
         return {**batch, **self._points(plan, logits[: len(plan.rows)].float(), generator)}
+
+    def taught(self, images: Tensor) -> dict[str, Tensor]:
+        """What the teachers say of views (V, 1, H, W) uint8: `detector` and, with a teacher of it, `stability`."""
+        network_input = (images.float() / 255).contiguous(memory_format=torch.channels_last)
+        said = {"detector": self.detector(network_input)}
+        if self.stability is not None:
+            said["stability"] = self.stability(network_input[:: self.settings.stability_every])
+        return said
 
     def _plan(self, rng: np.random.Generator, count: int) -> _Plan:
         """Which pictures are seen, and from where."""

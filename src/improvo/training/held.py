@@ -38,7 +38,7 @@ class HeldStage(Stage):
             scale = self.log_scale.exp().clamp(max=100)
             descriptor = info_nce_loss(
                 a, b, points_a, points_b, batch["valid"], scale, settings.masked_pixels,
-                group=math.gcd(settings.pairs.group, len(a)), scenes=batch["scenes"],
+                negative=batch.get("negative"), group=math.gcd(settings.pairs.group, len(a)), scenes=batch["scenes"],
             )  # fmt: skip
             detector = held_loss(detector_logits, batch["detector"])
             total = settings.descriptor_weight * descriptor + settings.detector_weight * detector

@@ -23,7 +23,7 @@ from improvo.training.pictures import Pictures
 from improvo.training.posed import PosedSequence
 from improvo.training.settings import HeldSettings
 from improvo.training.stage_folder import model_card, run_stage
-from improvo.training.trainer import choose_device, choose_precision
+from improvo.training.trainer import Batches, choose_device, choose_precision
 
 
 def train_held(
@@ -36,6 +36,7 @@ def train_held(
     data: tuple[DataSource, ...] = (),
     progress: bool = True,
     seconds: float = 0.0,
+    labels: Sequence[Path] = (),
 ) -> dict[str, Any]:
     """Descriptors from homographies and, between the frames of posed sequences, from depth; the last row of metrics.
 
@@ -44,6 +45,7 @@ def train_held(
         stability_from: weights whose stability head is held to; without it the result has no such head.
         data: what the model card says about the pictures; the sources' names where it is empty.
         seconds: of preparing and training; where given, the number of steps follows from it.
+        labels: label stores, whose tracks teach in every second step; left out where no frame has enough of them.
     """
     begun = time.monotonic()
     parent = load_weights(start)
@@ -53,10 +55,11 @@ def train_held(
     network = _student(parent, stability, settings)
     device = choose_device(settings.optimiser.device)
     precision = choose_precision(settings.optimiser.precision, device)
-    batches = DevicePairs(
+    dense = DevicePairs(
         pictures, posed, settings, network_teacher(parent, "detector", device, precision),
         network_teacher(stability, "stability", device, precision) if stability else None, device,
     )  # fmt: skip
+    batches = _with_tracks(dense, labels)
     if not data:
         names = (*(source.name for source in pictures.sources), *(sequence.name for sequence in posed))
         data = tuple(DataSource(name, "not stated") for name in names)
@@ -71,6 +74,19 @@ def train_held(
     card = replace(card, notes="") if stability else card
     left = max(seconds - (time.monotonic() - begun), 0.1) if seconds else 0.0
     return run_stage(HeldStage(network, settings), batches, settings, output, card, progress, left)
+
+
+def _with_tracks(dense: DevicePairs, labels: Sequence[Path]) -> Batches:
+    from improvo.labeling.labeled import read_labels
+    from improvo.training.labeled_frames import LabeledFrames
+    from improvo.training.mixed_pairs import MixedPairs, tracked_settings
+    from improvo.training.tracked_pairs import TrackedPairs
+
+    settings = tracked_settings(dense.settings)
+    sequences = [sequence for folder in labels for sequence in read_labels(folder)]
+    frames = [LabeledFrames(sequence, settings.longer_side, settings.landmarks) for sequence in sequences]
+    useful = [labelled for labelled in frames if len(labelled.useful_frames(settings.pairs.least_points))]
+    return MixedPairs(dense, TrackedPairs(useful, settings)) if useful else dense
 
 
 def network_teacher(weights: Weights, head: str, device: torch.device, precision: torch.dtype) -> Teacher:

@@ -1,5 +1,6 @@
-"""Files of strangers: what they say of their own size and shape is checked before it is believed.
+"""Safe reading of files from unknown sources: the sizes and shapes that a file declares are checked before it is read.
 
-The limits are in `limits`, all in one place. Each kind has one helper: `text` for YAML and JSON, `arrays` for NumPy's
-archives, `pictures` for the sizes that encoded images name, `decompression` for compressed parts, `paths` for names.
+It imports no other room. Open `limits.py` first: all limits in one place. Each kind of file has one helper: `text` for
+YAML and JSON, `arrays` for NumPy's archives, `pictures` for image headers, `decompression` for compressed parts,
+`paths` for file names.
 """

@@ -31,7 +31,7 @@ def is_plain(text: str) -> bool:
     first = rows[0]
     if first[0].lower() in _DSO_MODELS and len(first) > 4:
         return True
-    if len(first) > 4 and re.fullmatch(r"[A-Z_]{3,}", first[1]) and first[0].isdigit():
+    if len(first) > 4 and re.fullmatch(r"[A-Z_]{3,}", first[1]) and first[0].isdecimal():
         return True
     return all(_is_number(field) for field in first)
 

@@ -1,0 +1,92 @@
+"""What a round will take, said before it begins: minutes, memory and disk, from the amount of video."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from improvo.errors import OutputError
+from improvo.improvement.recipe import steps_of
+from improvo.improvement.settings import HELD, ImproveSettings
+
+# seconds on two calm cores with `superpoint-small`; `superpoint` takes about four times as long where it trains
+_SECONDS_PER_FRAME = 0.12  # of odometry, at 640x480
+_SECONDS_PER_DEPTH = 0.35
+_SECONDS_PER_STEP = 0.75
+_SECONDS_PER_PAIR = 0.08
+_LARGER = 4.0  # times as long for a step of the full network
+_MIB = 2**20
+_TORCH_MIB = 900  # of a process that trains
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Roughly what is needed, within a factor of two."""
+
+    minutes: float
+    memory_mib: float
+    disk_mib: float
+    steps: int
+
+    @property
+    def words(self) -> str:
+        """For a person."""
+        return (
+            f"about {max(self.minutes, 1):.0f} minutes on two calm cores, {self.memory_mib / 1024:.1f} GiB of memory "
+            f"and {self.disk_mib:.0f} MiB of disk; {self.steps} steps of training a round"
+        )
+
+
+def estimate(
+    settings: ImproveSettings, rounds: int, training: int, held_back: int, pixels: int, parameters: int
+) -> Estimate:
+    """Estimate all of the loop.
+
+    Args:
+        settings: of the loop.
+        rounds: to come.
+        training, held_back: frames of the two parts.
+        pixels: of a frame.
+        parameters: of the network.
+    """
+    size = pixels / (640 * 480)
+    reference = settings.reference
+    deep = min(training, reference.most_training) + min(held_back, reference.most_held_back)
+    steps = steps_of(settings, training)
+    trainings = rounds + settings.control
+    step = _SECONDS_PER_STEP * (_LARGER if parameters > 1_000_000 else 1.0)
+    each = 60 * settings.minutes if settings.minutes else steps * step
+    validation = 0.12 * size * held_back * 2 + 3 * settings.validation.matches.pairs * _SECONDS_PER_PAIR
+    frames = (2 if settings.recipe == HELD else 1) * (training + held_back) + (rounds - 1) * training
+    seconds = (
+        frames * _SECONDS_PER_FRAME * size
+        + deep * _SECONDS_PER_DEPTH * size
+        + trainings * each
+        + (1 + trainings) * validation
+    )
+    small = min(pixels, settings.held.longer_side**2 * 3 // 4)
+    memory = _TORCH_MIB + min(training, reference.most_training) * (2.5 * small + 4 * pixels / 4) / _MIB
+    disk = 60 + 0.1 * (training + held_back) * (1 + trainings) + deep * pixels / 4 * 1.3 / _MIB + 12 * trainings
+    return Estimate(seconds / 60, memory, disk, steps)
+
+
+def refuse_full_disk(folder: Path, needed: Estimate) -> None:
+    """Say that the disk is too full before hours of work, not after.
+
+    Raises:
+        OutputError: less is free than a third of what is estimated.
+    """
+    free = shutil.disk_usage(_existing(folder)).free / _MIB
+    if free < needed.disk_mib / 3:
+        raise OutputError(
+            f"{folder}: {free:.0f} MiB are free where about {needed.disk_mib:.0f} MiB are needed; make room, or choose "
+            "a folder on another disk"
+        )
+
+
+def _existing(folder: Path) -> Path:
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return Path(os.path.realpath(folder))

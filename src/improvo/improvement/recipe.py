@@ -1,0 +1,102 @@
+"""How a round trains: the recipes, their controls, and how many steps they take."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from improvo.improvement.reference import ReferencePart
+from improvo.improvement.settings import HELD, ImproveSettings
+from improvo.labeling.store import DONE, read_records
+
+if TYPE_CHECKING:
+    from improvo.frontend.weights import DataSource
+    from improvo.training.posed import PosedSequence
+
+_FEWEST = 300  # steps, however short the training part is
+
+
+@dataclass(frozen=True)
+class TrainingJob:
+    """All that one training depends on."""
+
+    settings: ImproveSettings
+    seed: int
+    start: Path  # weights
+    output: Path
+    labels: Path  # label store of the training part, made with the start of this training
+    reference: tuple[ReferencePart, ...]  # of the training part
+    control: bool = False  # by homographies of the same frames alone
+    steps: int = 0  # of the control; 0 for what the settings say
+    data: tuple[DataSource, ...] = ()
+    progress: bool = True
+
+
+Train = Callable[[TrainingJob], dict[str, Any]]
+
+
+def train(job: TrainingJob) -> dict[str, Any]:
+    """Train as the recipe says; the last row of metrics."""
+    return _train_held(job) if job.settings.recipe == HELD else _train_tracks(job)
+
+
+def steps_of(settings: ImproveSettings, frames: int) -> int:
+    """Steps of a training without a limit of time.
+
+    Args:
+        settings: of the loop.
+        frames: of the training part.
+    """
+    if settings.recipe != HELD:
+        return settings.training.optimiser.steps
+    most = settings.held.optimiser.steps
+    return min(max(round(settings.steps_per_frame * frames), _FEWEST), most) if settings.steps_per_frame else most
+
+
+def _train_held(job: TrainingJob) -> dict[str, Any]:
+    from improvo.frontend.weights import load_weights
+    from improvo.training.held_training import train_held
+    from improvo.training.pictures import Pictures, Source
+
+    settings = job.settings.held
+    posed = [entry for part in job.reference for entry in part.teaching_frames(settings.longer_side)]
+    sources = [_source(entry, Source) for entry in posed]
+    steps = job.steps or steps_of(job.settings, sum(len(part.frames) for part in job.reference))
+    optimiser = replace(settings.optimiser, steps=steps, seed=job.seed)
+    pairs = replace(settings.pairs, two_frames=settings.pairs.two_frames and not job.control)
+    has_head = load_weights(job.start).architecture.stability
+    return train_held(
+        Pictures(tuple(sources)),
+        posed,
+        replace(settings, optimiser=optimiser, pairs=pairs),
+        job.output,
+        job.start,
+        job.start if has_head else None,
+        job.data,
+        job.progress,
+        0.0 if job.control else 60 * job.settings.minutes,
+        () if job.control or not _has_labels(job.labels) else (job.labels,),
+    )
+
+
+def _has_labels(store: Path) -> bool:
+    return store.is_dir() and any(record.state == DONE for record in read_records(store))
+
+
+def _source(posed: PosedSequence, kind: Any) -> Any:
+    """The same frames as single pictures, for homography pairs."""
+    return kind(posed.name, posed.pictures, ("",) * len(posed.pictures), float(np.sqrt(len(posed.pictures))))
+
+
+def _train_tracks(job: TrainingJob) -> dict[str, Any]:
+    from improvo.training.stages import train_odometry
+
+    settings = job.settings.training
+    steps = job.steps or settings.optimiser.steps
+    pairs = replace(settings.pairs, same_frame_share=1.0) if job.control else settings.pairs
+    settings = replace(settings, pairs=pairs, optimiser=replace(settings.optimiser, steps=steps, seed=job.seed))
+    return train_odometry([job.labels], settings, job.output, job.start, job.data, job.progress)
