@@ -337,3 +337,34 @@ def test_a_detector_can_be_left_to_replay(store: Path) -> None:
     assert (taught["cells"] != IGNORED).any()
     assert (left["cells"] == IGNORED).all()
     assert np.array_equal(taught["points_a"], left["points_a"])
+
+
+def test_masked_cells_and_points_teach_nothing(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from improvo.labeling.labeled import LabeledSequence
+
+    mask = np.ones((120, 160), np.bool_)
+    mask[60:] = False
+    plain = [frames_of(store, LandmarkSettings()).points(frame) for frame in range(40)]
+    assert any((known.points[~known.seen, 1] > 60).any() for known in plain)
+    monkeypatch.setattr(LabeledSequence, "mask", lambda self, frame: mask)
+    frames = frames_of(store, LandmarkSettings())
+    for known in map(frames.points, range(40)):
+        assert (known.points[~known.seen, 1] < 60).all()  # what a track saw is the business of the frontend
+    upright = ViewSettings(64, 96, 1.0, 1.0, rotation_degrees=0, perspective=0, stretch=0)
+    same_frame = replace(settings_of().pairs, same_frame_share=1.0)
+    pairs = TrackedPairs([frames], settings_of(views=upright, pairs=same_frame))
+    taught = 0
+    for seed in range(8):
+        first, second, places = pairs._pair(np.random.default_rng(seed))
+        for view, points in ((first, places.a), (second, places.b)):
+            assert view.used is not None
+            whole = view.used.reshape(len(view.cells), 8, -1, 8).all(axis=(1, 3))
+            assert not whole.all()
+            assert (view.cells[~whole] != 64).all()
+            row, column = np.nonzero((view.cells >= 0) & (view.cells < 64))
+            value = view.cells[row, column]
+            assert view.used[8 * row + value // 8, 8 * column + value % 8].all()
+            x, y = np.rint(points[places.valid]).astype(int).T
+            assert view.used[y, x].all()
+            taught += len(x)
+    assert taught

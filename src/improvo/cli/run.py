@@ -14,6 +14,7 @@ from improvo.cli.flags import add_setting
 from improvo.cli.options import add_config_arguments, add_frontend_arguments, add_sequence_arguments, settings_from
 from improvo.cli.output import figures, next_step, notice, say
 from improvo.depth.run_settings import DenseRunSettings
+from improvo.errors import InputError
 from improvo.odometry.scale.settings import USAGE, scale_settings
 
 if TYPE_CHECKING:
@@ -81,9 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
     ask = _scale_source(sequence, settings)
     summary = _track(sequence, arguments.output, settings, _viewer(arguments))
     if ask is not None:
-        from improvo.odometry.scale.apply import apply_scale
-
-        summary = apply_scale(sequence, summary, ask, settings.scale)
+        summary = _in_metres(sequence, summary, ask, settings)
     figures(_figures(summary), "")
     _print_summary(summary)
     interrupted = bool(summary.report["interrupted"])
@@ -121,6 +120,16 @@ def _scale_source(sequence: Sequence, settings: DenseRunSettings) -> Ask | None:
 
     with progress("markers", "frame", shown=settings.scale.source == "marker") as shown:
         return scale_source(sequence, settings.scale, shown.advance)
+
+
+def _in_metres(sequence: Sequence, summary: LabeledRun, ask: Ask, settings: DenseRunSettings) -> LabeledRun:
+    """The run in metres; an error says that the results are there all the same."""
+    from improvo.odometry.scale.apply import apply_scale
+
+    try:
+        return apply_scale(sequence, summary, ask, settings.scale)
+    except InputError as error:
+        raise InputError(f"{error}; {summary.folder} holds the run, up to scale") from None
 
 
 def _track(sequence: Sequence, folder: Path, settings: DenseRunSettings, viewer: Visualizer | None) -> LabeledRun:
