@@ -227,3 +227,14 @@ class TestBadInput:
         status = main(["run", str(video), "-o", str(out), "--camera", CAMERA_TEXT, "--frontend", "orb"])
         assert status == 0
         assert 8 <= json.loads((out / "run.json").read_text())["frames"]["processed"] < 24
+
+
+def test_demo_is_the_bundled_recording_unless_there_is_such_a_path(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["info", "demo", "--samples", "2"]) == 0
+    assert "recognised as  tum" in capsys.readouterr().out
+    assert main(["run", "demo", "-o", "out", "--frontend", "orb", "--max-frames", "12", "--scale", "truth"]) == 0
+    assert "12 frames" in capsys.readouterr().out
+    (tmp_path / "demo").mkdir()
+    assert main(["info", "demo"]) == 2
+    assert "the folder is empty" in capsys.readouterr().err

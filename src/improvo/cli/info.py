@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from improvo.cli.flags import add_setting
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import figures, next_step, say
 from improvo.sequences.settings import InfoSettings
 
@@ -17,7 +17,12 @@ _CAMERA = ("format", "camera", "fov", "topic")  # options that a run of the same
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `improvo info`."""
-    parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a video, an image folder, a data set or a bag")
+    parser.add_argument(
+        "sequence",
+        type=recording_path,
+        metavar="SEQUENCE",
+        help="a video, an image folder, a data set, a bag, or `demo`",
+    )
     add_setting(parser, InfoSettings(), "--samples", "samples", help="pairs of frames to look at")
     parser.add_argument(
         "--write-mask",

@@ -73,6 +73,16 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def recording_path(text: str) -> Path:
+    """The path of a recording; `demo`, where there is no such path, is the bundled one."""
+    path = Path(text)
+    if text != "demo" or path.exists():
+        return path
+    from improvo.simulation import bundled_sequence
+
+    return bundled_sequence()
+
+
 def check_recordings(paths: list[Path]) -> None:
     """Refuse a list of recordings of which none is there; where only some are missing, the rest is worked on.
 

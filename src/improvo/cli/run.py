@@ -11,7 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from improvo.cli.flags import add_setting
-from improvo.cli.options import add_config_arguments, add_frontend_arguments, add_sequence_arguments, settings_from
+from improvo.cli.options import (
+    add_config_arguments,
+    add_frontend_arguments,
+    add_sequence_arguments,
+    recording_path,
+    settings_from,
+)
 from improvo.cli.output import figures, next_step, notice, say
 from improvo.depth.run_settings import DenseRunSettings
 from improvo.errors import InputError
@@ -30,7 +36,9 @@ _WARNINGS = 5  # printed; run.json has them all
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `improvo run`."""
     defaults = DenseRunSettings()
-    parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a video, an image folder or a data set")
+    parser.add_argument(
+        "sequence", type=recording_path, metavar="SEQUENCE", help="a video, an image folder, a data set, or `demo`"
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
     add_frontend_arguments(parser, defaults)
     add_setting(parser, defaults, "--mode", "odometry.mode", choices=("robust", "paper"))
