@@ -249,7 +249,7 @@ def _own_targets() -> dict[str, Target]:
     from improvo.depth.archive import DepthReader, DepthWriter
     from improvo.files import check_output_folder, make_output_folder
     from improvo.improvement.split import Part, Split, remembered_split
-    from improvo.improvement.validation import Validation, read_validation, write_validation
+    from improvo.improvement.validation import GapScores, Validation, read_validation, write_validation
     from improvo.labeling.labeled import read_labels
     from improvo.odometry.map_file import read_map, write_map
     from improvo.odometry.run_folder import RunFolder, why_no_pose
@@ -275,12 +275,10 @@ def _own_targets() -> dict[str, Target]:
         return folder / "split.json"
 
     def judgement(folder: Path) -> Path:
-        numbers = {"30": [3, 4], "60": [1, 2]}
-        share = {"30": 0.5, "60": 0.2}
-        seconds = {"label": 1.0, "evaluate": 2.0}
-        labels = {"stable": 3}
+        scores = GapScores("room", 0, 30, 1.0, [[0, 30], [4, 34]], [50, 40], {"right_8px": [0.5, 0.25]})
+        labels, seconds = {"stable": 3, "unstable": 1, "ignore": 2}, {"label": 1.0, "evaluate": 2.0}
         write_validation(
-            folder / "judgement.json", Validation(9, 9, 3.0, 0.9, 0.4, labels, numbers, share, seconds=seconds)
+            folder / "judgement.json", Validation(9, 9, 1, 3.0, 0.9, 0.4, labels, (scores,), seconds=seconds)
         )
         return folder / "judgement.json"
 

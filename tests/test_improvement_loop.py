@@ -185,14 +185,14 @@ def test_the_control_is_judged_like_a_round_and_never_kept(walk: Path, tmp_path:
 
 def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(walk: Path, tmp_path: Path) -> None:
     good = [walk, write_walk(tmp_path / "hall", frames=30, seed=1)]
-    black, short, cut = tmp_path / "black", tmp_path / "short", tmp_path / "cut"
-    for folder, frames in ((black, 12), (short, 10), (cut, 24)):
+    black, dark, short, cut = (tmp_path / name for name in ("black", "dark", "short", "cut"))
+    for folder, frames in ((black, 12), (dark, 12), (short, 10), (cut, 24)):
         folder.mkdir()
         (folder / "camera.yaml").write_text((walk / "camera.yaml").read_text())
         for i in range(frames):
             source = good[i % 2 if folder is cut and i >= 12 else 0]
             picture = cv2.imread(str(source / f"{i if folder is not cut else i % 12:06d}.png"), cv2.IMREAD_GRAYSCALE)
-            cv2.imwrite(str(folder / f"{i:06d}.png"), picture * (folder is not black))
+            cv2.imwrite(str(folder / f"{i:06d}.png"), picture * (folder not in (black, dark)))
     (walk / "000004.png").rename(walk / "gone")
     (walk / "000004.png").write_bytes(b"no picture")
     try:
@@ -217,7 +217,7 @@ def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(wa
     assert (tmp_path / "out" / "reference" / "hall" / "depth-held-back.zip").is_file()
     assert not (tmp_path / "out" / "reference" / "hall" / "depth-training.zip").exists()
     with pytest.raises(InputError, match="nothing could be labelled"):
-        run(tmp_path / "nothing", [black, short], FakeTraining())
+        run(tmp_path / "nothing", [black, dark], FakeTraining())
     few = replace(SETTINGS, sequence=replace(SETTINGS.sequence, end=5))
     with pytest.raises(InputError, match="too few"):
         run(tmp_path / "too-short", [short], FakeTraining(), settings=few)
