@@ -61,7 +61,7 @@ def all_tasks() -> dict[str, list[str]]:
         "train-homographies": homographies,
         "train-homographies-detector": f"{homographies} --detector superpoint-small",
         "train-odometry": f"{odometry} --pictures {{demo}}",
-        "train-odometry-paper": f"{odometry} --paper",
+        "train-odometry-paper": f"{odometry} --preset paper",
     }
     return {name: words.split() for name, words in tasks.items()}
 
