@@ -8,9 +8,11 @@ BIN = $(VENV)/bin
 demo: $(VENV)/.run-installed
 	$(BIN)/improvo demo -o output/demo
 
-# The training tests have a process of their own: PyTorch once crashed there after all the other libraries' threads.
+# The tests of training and of worker processes have processes of their own: after the threads of all the other
+# libraries, in one long process, they crashed now and then.
 test: $(VENV)/.dev-installed lint
-	$(BIN)/python -m pytest --ignore-glob='*/test_training_*'
+	$(BIN)/python -m pytest --ignore-glob='*/test_training_*' --ignore-glob='*/test_jobs_*'
+	$(BIN)/python -m pytest tests/test_jobs_*.py
 	$(BIN)/python -m pytest tests/test_training_*.py
 
 lint: $(VENV)/.dev-installed
