@@ -168,12 +168,13 @@ COMMANDS: dict[str, Command] = {
         },
     ),
     "weights": Command(
-        "import public weights, prepare weights for int8, print a model card",
+        "import public weights, export ours for other programs, prepare for int8, print a model card",
         part_name="ACTION",
         parts={
             "import": Command(
                 "convert a public SuperPoint weights file (three layouts, .pth or .safetensors)", "weights:import"
             ),
+            "export": Command("write weights in the layout of another SuperPoint implementation", "weights:export"),
             "calibrate": Command(
                 "measure activation ranges on pictures, so that weights can run in int8", "weights:calibrate"
             ),

@@ -1,4 +1,4 @@
-"""A network with its decoding as one ONNX file, for programs that use ONNX Runtime without improvo."""
+"""A network with its decoding as one ONNX file, for programs that use ONNX Runtime, or OpenCV 5, without improvo."""
 
 from __future__ import annotations
 
@@ -21,12 +21,14 @@ OPSET = 17
 IR_VERSION = 8  # the oldest that holds this opset: readable by ONNX Runtime 1.13 and later
 
 
-def export_onnx(weights: Weights, path: Path, settings: NetworkSettings) -> None:
+def export_onnx(weights: Weights, path: Path, settings: NetworkSettings, layout: str = "improvo") -> None:
     """Write an ONNX model that gives what `NetworkFrontend` gives, for a batch of images of any one size.
 
     Input `image` (batch, 1, height, width) float32 in [0, 1]. Outputs, with N = `settings.max_keypoints`:
     `keypoints` (batch, N, 2) x, y; `scores` (batch, N), best first; `descriptors` (batch, N, D); `stability` (batch, N)
     where there is such a head; `valid` (batch, N) bool, False on the rows past the last keypoint, which mean nothing.
+
+    With the layout `opencv` it is what `cv2.ALIKED` of OpenCV 5 loads (`export/onnx_opencv.py`).
 
     Raises:
         MissingExtraError: the package onnx is not installed.
@@ -38,21 +40,30 @@ def export_onnx(weights: Weights, path: Path, settings: NetworkSettings) -> None
     except ImportError:
         raise MissingExtraError("exporting ONNX", "onnx") from None
 
-    graph = _Graph(helper, onnx.numpy_helper)
-    outputs = _build(graph, without_dead_channels(weights), settings)
+    from improvo.export import onnx_opencv
+
+    graph = Graph(helper, onnx.numpy_helper)
+    width = weights.architecture.descriptor
+    for_opencv = layout == "opencv"
+    image = onnx_opencv.grey(graph) if for_opencv else "image"
+    outputs = _build(graph, without_dead_channels(weights), settings, image)
+    shapes = onnx_opencv.SHAPES if for_opencv else _shapes(settings.max_keypoints)
+    for name, node in (onnx_opencv.outputs(graph, outputs) if for_opencv else outputs).items():
+        graph.node("Identity", node, name=name)
     float32, boolean = onnx.TensorProto.FLOAT, onnx.TensorProto.BOOL
-    count, width = settings.max_keypoints, weights.architecture.descriptor
-    tails: dict[str, list[int]] = {"keypoints": [count, 2], "descriptors": [count, width]}
+    size = [1, 3, "height", "width"] if for_opencv else ["batch", 1, "height", "width"]
     model = helper.make_model(
         helper.make_graph(
             graph.nodes,
             weights.architecture.name,
-            [helper.make_tensor_value_info("image", float32, ["batch", 1, "height", "width"])],
+            [helper.make_tensor_value_info("image", float32, size)],
             [
                 helper.make_tensor_value_info(
-                    name, boolean if name == "valid" else float32, ["batch", *tails.get(name, [count])]
+                    name,
+                    boolean if name == "valid" else float32,
+                    [width if side == "width" else side for side in shapes[name]],
                 )
-                for name in outputs
+                for name in (shapes if for_opencv else outputs)
             ],
             graph.constants,
         ),
@@ -67,7 +78,14 @@ def export_onnx(weights: Weights, path: Path, settings: NetworkSettings) -> None
         onnx.save(model, temporary)
 
 
-class _Graph:
+def _shapes(count: int) -> dict[str, tuple[int | str, ...]]:
+    """Of the outputs, by name; `width` is that of a descriptor."""
+    shapes: dict[str, tuple[int | str, ...]] = {"keypoints": ("batch", count, 2)}
+    shapes["descriptors"] = ("batch", count, "width")
+    return shapes | dict.fromkeys(("scores", "stability", "valid"), ("batch", count))
+
+
+class Graph:
     """Collects nodes and constants; `node` and `constant` return the name of what they add."""
 
     def __init__(self, helper: Any, numpy_helper: Any) -> None:
@@ -93,14 +111,14 @@ class _Graph:
         return str(self.node("Slice", node, starts, ends, self.constant(np.array(axes))))
 
 
-def _build(graph: _Graph, weights: Weights, settings: NetworkSettings) -> list[str]:
-    """The whole model; returns the names of its outputs."""
-    size = graph.slice(graph.node("Shape", "image"), [0], graph.constant([2]), graph.constant([4]))  # height, width
+def _build(graph: Graph, weights: Weights, settings: NetworkSettings, image: str) -> dict[str, str]:
+    """The whole model from a grey `image` (batch, 1, height, width); the nodes of its outputs by name."""
+    size = graph.slice(graph.node("Shape", image), [0], graph.constant([2]), graph.constant([4]))  # height, width
     width = graph.slice(size, [0], graph.constant([1]), graph.constant([2]))
     padding = graph.node("Mod", graph.node("Neg", size), graph.constant([CELL]))
     padded_size = graph.node("Add", size, padding)
     pads = graph.node("Concat", graph.constant([0] * 6), padding, axis=0)
-    maps = _network(graph, weights, graph.node("Pad", "image", pads, mode="edge"))
+    maps = _network(graph, weights, graph.node("Pad", image, pads, mode="edge"))
 
     heat = graph.slice(_heat_map(graph, maps["detector"]), [2, 3], graph.constant([0, 0]), size)
     scores, index = _best_pixels(graph, heat, size, settings)
@@ -109,23 +127,19 @@ def _build(graph: _Graph, weights: Weights, settings: NetworkSettings) -> list[s
     keypoints = graph.node("Cast", graph.node("Concat", *pixels, axis=2), to=1)
     if settings.subpixel_radius:
         keypoints = graph.node("Add", keypoints, _offsets(graph, heat, size, index, settings.subpixel_radius))
-    graph.node("Identity", keypoints, name="keypoints")
-    graph.node("Identity", scores, name="scores")
-    graph.node("Greater", scores, graph.number(0), name="valid")
-
+    outputs = {"keypoints": str(keypoints), "scores": scores}
     grid = _sampling_grid(graph, keypoints, padded_size)
     cells = graph.node("LpNormalization", maps["descriptor"], axis=1, p=2)
-    graph.node("LpNormalization", _sample(graph, cells, grid), axis=2, p=2, name="descriptors")
-    outputs = ["keypoints", "scores", "descriptors", "valid"]
+    outputs["descriptors"] = graph.node("LpNormalization", _sample(graph, cells, grid), axis=2, p=2)
     if "stability" in maps:
         probabilities = graph.node("Softmax", _sample(graph, maps["stability"], grid), axis=2)
         stable = graph.slice(probabilities, [2], graph.constant([1]), graph.constant([2]))
-        graph.node("Squeeze", stable, graph.constant([2]), name="stability")
-        outputs.insert(3, "stability")
+        outputs["stability"] = graph.node("Squeeze", stable, graph.constant([2]))
+    outputs["valid"] = graph.node("Greater", scores, graph.number(0))
     return outputs
 
 
-def _network(graph: _Graph, weights: Weights, image: str) -> dict[str, str]:
+def _network(graph: Graph, weights: Weights, image: str) -> dict[str, str]:
     """Raw output of every head."""
     layers = {layer.convolution.name: layer for layer in weights.folded()}
     shared = image
@@ -138,7 +152,7 @@ def _network(graph: _Graph, weights: Weights, image: str) -> dict[str, str]:
     return {head: _convolution(graph, layers[f"{head}.1"], first[head]) for head in heads}
 
 
-def _convolution(graph: _Graph, layer: FoldedLayer, node: str) -> str:
+def _convolution(graph: Graph, layer: FoldedLayer, node: str) -> str:
     pad = layer.convolution.kernel // 2
     weight, bias = graph.constant(layer.weight), graph.constant(layer.bias)
     node = graph.node("Conv", node, weight, bias, pads=[pad] * 4)
@@ -151,13 +165,13 @@ def _convolution(graph: _Graph, layer: FoldedLayer, node: str) -> str:
     return node
 
 
-def _heat_map(graph: _Graph, logits: str) -> str:
+def _heat_map(graph: Graph, logits: str) -> str:
     probabilities = graph.node("Softmax", logits, axis=1)
     pixels = graph.slice(probabilities, [1], graph.constant([0]), graph.constant([CELL * CELL]))
     return str(graph.node("DepthToSpace", pixels, blocksize=CELL, mode="DCR"))
 
 
-def _best_pixels(graph: _Graph, heat: str, size: str, settings: NetworkSettings) -> tuple[str, str]:
+def _best_pixels(graph: Graph, heat: str, size: str, settings: NetworkSettings) -> tuple[str, str]:
     """Scores (B, N) of the best local maxima and their position row · width + column, zero where there are no more."""
     radius, border = settings.nms_radius, settings.border
     window = 2 * radius + 1
@@ -177,7 +191,7 @@ def _best_pixels(graph: _Graph, heat: str, size: str, settings: NetworkSettings)
     return best_scores, graph.node("Min", index, last)
 
 
-def _offsets(graph: _Graph, heat: str, size: str, index: str, radius: int) -> str:
+def _offsets(graph: Graph, heat: str, size: str, index: str, radius: int) -> str:
     """Centre of mass of the heat map around the pixels at `index` (B, N), as offsets (B, N, 2)."""
     steps = np.arange(-radius, radius + 1, dtype=np.float32)
     y, x = np.meshgrid(steps, steps, indexing="ij")
@@ -192,11 +206,11 @@ def _offsets(graph: _Graph, heat: str, size: str, index: str, radius: int) -> st
     return str(graph.node("Div", moments, graph.node("Max", mass, graph.number(1e-30))))
 
 
-def _unsqueezed(graph: _Graph, index: str) -> str:
+def _unsqueezed(graph: Graph, index: str) -> str:
     return str(graph.node("Unsqueeze", index, graph.constant([2])))
 
 
-def _sampling_grid(graph: _Graph, keypoints: str, padded_size: str) -> str:
+def _sampling_grid(graph: Graph, keypoints: str, padded_size: str) -> str:
     """Keypoints (B, N, 2) as a grid (B, 1, N, 2) in which -1 and 1 are the outer edges of the padded image."""
     width_height = graph.node("Gather", padded_size, graph.constant([1, 0]))
     scaled = graph.node("Add", graph.node("Mul", keypoints, graph.number(2)), graph.number(1))
@@ -204,7 +218,7 @@ def _sampling_grid(graph: _Graph, keypoints: str, padded_size: str) -> str:
     return str(graph.node("Unsqueeze", graph.node("Sub", scaled, graph.number(1)), graph.constant([1])))
 
 
-def _sample(graph: _Graph, cells: str, grid: str) -> str:
+def _sample(graph: Graph, cells: str, grid: str) -> str:
     """Bilinear values (B, N, C) of cells (B, C, Hc, Wc)."""
     values = graph.node("GridSample", cells, grid, mode="bilinear", padding_mode="border", align_corners=0)
     return str(graph.node("Transpose", graph.node("Squeeze", values, graph.constant([2])), perm=[0, 2, 1]))
