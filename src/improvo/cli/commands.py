@@ -158,12 +158,17 @@ COMMANDS: dict[str, Command] = {
     ),
     "report": Command("one HTML page about a run, labels or an evaluation", "report"),
     "export": Command(
-        "what other tools read: COLMAP, Nerfstudio, trajectories, ONNX",
+        "what other tools read: COLMAP, Nerfstudio, trajectories, features, ONNX",
         part_name="TARGET",
         parts={
             "colmap": Command("a finished run as COLMAP's sparse model, with images", "export:colmap"),
             "nerfstudio": Command("a finished run as Nerfstudio's transforms.json, with images", "export:nerfstudio"),
             "trajectory": Command("the poses of a finished run as TUM, KITTI or EuRoC file", "export:trajectory"),
+            "features": Command(
+                "features and matches of a recording, for hloc or COLMAP",
+                "export_features",
+                "improvo.export.settings:FeatureExportSettings",
+            ),
             "onnx": Command("a network with its decoding, for ONNX Runtime", "export:onnx"),
         },
     ),
