@@ -69,7 +69,8 @@ class LocalMap:
 
     def _is_lost(self, inliers: int, share: float) -> bool:
         loss = self._settings.loss
-        return inliers < loss.min_inliers or share < loss.min_inlier_share
+        outliers = inliers / share - inliers if share > 0 else 0.0
+        return inliers < loss.min_inliers + loss.wrong_share * outliers or share < loss.min_inlier_share
 
     def _match_with(self, view: View, earlier: View) -> None:
         """3D-to-2D matches of a view by descriptors alone, against the map points of one earlier view."""
