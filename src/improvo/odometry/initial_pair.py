@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -74,7 +74,8 @@ def initial_pair(
         return InitFailure("too few matches agree on a motion")
     if np.median(rotation_residuals(camera, pixels_a[inliers], pixels_b[inliers])) < start.min_rotation_residual:
         return InitFailure("too little parallax: a rotation explains the motion")
-    if has_second_motion(essential.pose, camera, pixels_a, pixels_b, ransac, start.max_second_motion):
+    another = replace(ransac, max_iterations=1000)
+    if has_second_motion(essential.pose, camera, pixels_a, pixels_b, another, start.max_second_motion):
         return InitFailure("two motions: one of them is not the camera's")
     ratio = plane.inliers.sum() / max(inliers.sum(), 1)
     off_plane = (inliers & ~plane.inliers).sum()
