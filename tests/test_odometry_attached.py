@@ -88,7 +88,7 @@ def test_a_person_before_a_still_camera_does_not_make_the_world_attached() -> No
     names /= np.linalg.norm(names, axis=1, keepdims=True)
     features = []
     for number, each in enumerate(still):
-        person = body + (40 + 5 * number, 120) + rng.normal(scale=0.3, size=body.shape)
+        person = body + np.array([40 + 5 * number, 120]) + rng.normal(scale=0.3, size=body.shape)
         both = np.concatenate([each.keypoints, person]).astype(np.float32)
         descriptors = np.concatenate([each.descriptors, names]).astype(np.float32)
         features.append(Features(both, descriptors, np.ones(len(both), np.float32)))

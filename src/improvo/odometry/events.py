@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 _WORTH_SAYING = 0.03  # share of the keypoints
+_SAID_AGAIN = 20  # frames
 
 
 @dataclass(frozen=True)
@@ -12,7 +13,7 @@ class Event:
     """Something the user should know about a frame."""
 
     frame_index: int
-    kind: str  # "initialising", "segment", "lost", "contradiction" or "attached"
+    kind: str  # "initialising", "segment", "lost", "contradiction", "attached", "two motions" or "focal length"
     detail: str
 
 
@@ -23,6 +24,7 @@ class EventLog:
         self.events: list[Event] = []
         self._last_failure = ""
         self._attached_said = 0.0
+        self._two_motions_said = -_SAID_AGAIN - 1
 
     def segment_started(self, frame_index: int, number: int) -> None:
         """A map has started; the first segment is not worth an event."""
@@ -43,6 +45,17 @@ class EventLog:
     def contradicted(self, frame_index: int, consequence: str, by: str = "two-view geometry") -> None:
         """Something says that the map is wrong."""
         self._add(frame_index, "contradiction", f"{by} contradicts the map; {consequence}")
+
+    def focal_length(self, frame_index: int, factor: float, consequence: str) -> None:
+        """The lens is not what the camera says."""
+        said = f"the focal length is about {factor:.2f} times that of the camera as given"
+        self._add(frame_index, "focal length", f"{said}; {consequence}")
+
+    def two_motions(self, frame_index: int) -> None:
+        """Two motions are in the picture, and one of them is not the camera's; said once in a while."""
+        if frame_index - self._two_motions_said > _SAID_AGAIN:
+            self._add(frame_index, "two motions", "another motion beside the map's; one of both is not the camera's")
+            self._two_motions_said = frame_index
 
     def attached(self, frame_index: int, share: float) -> None:
         """A share of the keypoints moves with the camera; said again only where it is much larger than before."""

@@ -17,6 +17,8 @@ from improvo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_poin
 from improvo.tracking.matching import match_units
 from improvo.types import Float32, Float64, Int64
 
+_SAME_SIDE = 0.5  # cosine of the angle between two rays to a point; features are not matched over 60 degrees
+
 
 class LocalMap:
     """Points and the views that saw them last.
@@ -54,11 +56,11 @@ class LocalMap:
         """
         inherit_points(view, neighbour)
         inliers, share = self._solve_pose(view)
-        if self._is_lost(inliers, share):
+        if self._is_lost(inliers, share) or not self._from_same_side(view, neighbour):
             for earlier in reversed(self.history):
                 self._match_with(view, earlier)
                 inliers, share = self._solve_pose(view)
-                if not self._is_lost(inliers, share):
+                if not self._is_lost(inliers, share) and self._from_same_side(view, earlier):
                     break
             else:
                 view.cam_from_world = None
@@ -69,7 +71,22 @@ class LocalMap:
 
     def _is_lost(self, inliers: int, share: float) -> bool:
         loss = self._settings.loss
-        return inliers < loss.min_inliers or share < loss.min_inlier_share
+        outliers = inliers / share - inliers if share > 0 else 0.0
+        return inliers < loss.min_inliers + loss.wrong_share * outliers or share < loss.min_inlier_share
+
+    def _from_same_side(self, view: View, other: View) -> bool:
+        """Whether a view sees its points from where another one, with a pose, can have seen the same of them.
+
+        A mirrored picture of a wall is the wall seen from behind: a good pose, and a wrong one.
+        """
+        assert view.cam_from_world is not None
+        assert other.cam_from_world is not None
+        xyz = self.store.xyz[view.points[view.observed]]
+        if len(xyz) == 0:
+            return False
+        rays = [xyz - se3.inverse(each.cam_from_world)[:3, 3] for each in (view, other)]
+        cosine = (rays[0] * rays[1]).sum(axis=1) / np.maximum(np.prod(np.linalg.norm(rays, axis=2), axis=0), 1e-12)
+        return bool(np.median(cosine) > _SAME_SIDE)
 
     def _match_with(self, view: View, earlier: View) -> None:
         """3D-to-2D matches of a view by descriptors alone, against the map points of one earlier view."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from improvo.geometry.camera import Camera
 from improvo.odometry.attached import AttachedDetector
 from improvo.odometry.events import EventLog
+from improvo.odometry.focal_change import focal_change
 from improvo.odometry.health import HealthCheck
 from improvo.odometry.initial_pair import InitFailure
 from improvo.odometry.local_map import LocalMap
@@ -19,6 +20,7 @@ from improvo.odometry.window import WindowReport, adjust
 from improvo.types import Float64
 
 _CARRIED = 0.2  # share of the observations that turned out to move with the camera; with more the map is wrong
+_SAME_LENS = 0.05  # relative change of the focal length that is none
 _FIRST_COOLDOWN = 3  # frames after a costly failure to start; it doubles with each further one
 
 
@@ -39,6 +41,7 @@ class RobustMapper(Mapper):
         self._cooldown = 0  # frames to wait before the next try to start
         self._costly_failures = 0  # since the last map
         self._worlds = 0  # maps started
+        self._focal_factor = 1.0  # of the lens now, times what the camera says
         self._carried = False  # a large part of the map has turned out to move with the camera
         self._window = SlidingWindow(settings.window, camera.width)
         self._health = HealthCheck(camera, settings, descriptor_distance)
@@ -60,6 +63,10 @@ class RobustMapper(Mapper):
             return
         if newly_attached and self._leave_out_attached(view, [*self._map.history, *self._buffer]) > _CARRIED:
             self._carried = True
+        if self._zoomed(self._map, view):
+            self._end_segment("the focal length changed")
+            self._initialise(view)
+            return
         inliers, _ = self._map.localise(view, self._window.newest)
         if view.cam_from_world is None:
             self._lose(view, inliers)
@@ -76,6 +83,8 @@ class RobustMapper(Mapper):
         if self._health.contradicts(view, {earlier.frame_index: earlier for earlier in self._map.history}):
             self._start_anew(view, "two-view geometry")
             return
+        if self._health.ambiguous:
+            self._events.two_motions(view.frame_index)
         self._confirm()
         self._slide()
 
@@ -116,6 +125,8 @@ class RobustMapper(Mapper):
         self._worlds += 1
         self._states.map_started()
         self._events.segment_started(self._buffer[0].frame_index, self._result.running_segment)
+        if self._focal_factor != 1.0:
+            self._events.focal_length(self._buffer[0].frame_index, self._focal_factor, "the segment is doubtful")
         self._result.begin_segment()
         self._result.give_up(each for each in self._buffer if each.cam_from_world is None)
         self._health = HealthCheck(self._camera, self._settings, self._descriptor_distance)
@@ -161,6 +172,20 @@ class RobustMapper(Mapper):
         if self._map is not None and not self._states.is_provisional:
             for view, cam_from_world in self._window.take_final():
                 self._finalise(self._map, view, cam_from_world)
+
+    def _zoomed(self, local_map: LocalMap, view: View) -> bool:
+        """Whether the lens changed just before a view. What it is now holds for all that follows, until it changes."""
+        before, settings = self._window.newest, self._settings
+        if before.frame_index != view.frame_index - 1:
+            return False
+        change = focal_change(before, view, local_map.store.xyz, self._camera, settings.window.max_error, settings.seed)
+        if change == 1.0:
+            return False
+        self._focal_factor *= change
+        if abs(self._focal_factor - 1.0) < _SAME_LENS:
+            self._focal_factor = 1.0
+        self._events.focal_length(view.frame_index, self._focal_factor, "the segment ends")
+        return True
 
     def _leave_out_attached(self, view: View, views: list[View]) -> float:
         """Mark earlier views anew, and drop what they observe there; returns its share of all that they observed."""

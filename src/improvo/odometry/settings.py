@@ -38,6 +38,7 @@ class StartSettings:
     max_homography_ratio: float = 0.7  # homography inliers over essential inliers; more is too little parallax, unless
     min_off_plane_points: int = 60  # so many essential inliers are no homography inliers, or
     plane_ratio: float = 0.8  # the ratio is at least this: then the scene is one plane, and its homography is used
+    max_second_motion: float = 0.5  # spread over the picture of another motion, as a share of the first one's
     min_parallax_deg: float = 1.0  # of a point, for it to count
     min_points: int = 30  # with that parallax
     min_inlier_share: float = 0.3  # essential inliers of the matches
@@ -71,6 +72,7 @@ class TrackingLossSettings:
     """When a frame, and when a segment, counts as lost."""
 
     min_inliers: int = 12
+    wrong_share: float = 0.1  # of wrong matches that agree with a wrong pose, where the scene repeats or is mirrored
     min_inlier_share: float = 0.1
     max_lost_frames: int = 10  # more frames than this without a pose end the segment
 
