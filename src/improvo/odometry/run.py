@@ -12,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from improvo import __version__
@@ -21,6 +22,7 @@ from improvo.files import make_output_folder, write_json
 from improvo.frontend import Frontend
 from improvo.frontend.masking import features_of
 from improvo.frontend.registry import frontend_from
+from improvo.geometry.ransac import robust_solver
 from improvo.geometry.trajectory_files import write_trajectory
 from improvo.jobs.interrupts import interrupts_wait
 from improvo.odometry.ahead import detected_ahead
@@ -194,5 +196,14 @@ def _number(value: float) -> float | None:
 
 
 def _versions() -> dict[str, str]:
-    packages = ("numpy", "numba", "opencv-contrib-python-headless", "poselib")
-    return {"improvo": __version__, "python": platform.python_version(), **{name: version(name) for name in packages}}
+    """Of what the numbers of a run depend on."""
+    solver = robust_solver().name
+    packages = ("numpy", "numba", *(["poselib"] if solver == "poselib" else []))
+    versions = {name: version(name) for name in packages}
+    return {
+        "improvo": __version__,
+        "python": platform.python_version(),
+        **versions,
+        "opencv": str(cv2.__version__),
+        "robust_solver": solver,
+    }
