@@ -42,7 +42,7 @@ def open_runtime(weights: Weights, settings: NetworkSettings) -> Runtime:
         MissingExtraError: the runtime's library is not installed.
     """
     weights = without_dead_channels(weights)
-    name = settings.runtime
+    name: str = settings.runtime
     if name == "auto":
         name = "torch" if settings.device == "cuda" or settings.precision == "float16" else cpu_runtime()
     if name == "torch":

@@ -19,6 +19,7 @@ from improvo import __version__
 from improvo.config import to_dict
 from improvo.errors import InputError
 from improvo.files import make_output_folder, write_json
+from improvo.formats import FORMAT, FORMAT_KEY
 from improvo.frontend import Frontend
 from improvo.frontend.masking import features_of
 from improvo.frontend.registry import frontend_from
@@ -157,6 +158,7 @@ def _report(
     has_pose = trajectory.valid
     camera = sequence.camera
     return {
+        FORMAT_KEY: FORMAT,
         "input": {
             "path": str(sequence.path),
             "format": sequence.format,
