@@ -275,3 +275,27 @@ def test_exported_onnx_finds_lit_pixels(tmp_path):
     image[0, 0, 36, 50] = 1  # in the border
     keypoints, valid = session.run(["keypoints", "valid"], {"image": image})
     assert sorted(map(tuple, keypoints[valid].tolist())) == [(13, 7), (41, 30)]
+
+
+@pytest.mark.skipif(not hasattr(cv2, "ALIKED"), reason="cv2.ALIKED came with OpenCV 5: pip install -U opencv-python")
+@pytest.mark.parametrize("size", [(101, 133), (64, 80)])
+def test_opencv_loads_the_exported_onnx_as_a_feature2d(tmp_path, size):
+    pytest.importorskip("onnx")
+    weights = random_weights()
+    save_weights(tmp_path / "tiny.safetensors", weights.tensors, weights.card)
+    target, options = str(tmp_path / "m.onnx"), ["--max-keypoints", "400", "--threshold", "0.01", "--layout", "opencv"]
+    assert main(["export", "onnx", str(tmp_path / "tiny.safetensors"), "-o", target, *options]) == 0
+    image = picture(*size)
+    parameters = cv2.ALIKED_Params()
+    parameters.inputSize = image.shape[::-1]
+    detector = cv2.ALIKED.create(target, parameters)
+    found, descriptors = detector.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), None)
+    expected = NetworkFrontend(weights, NetworkSettings(max_keypoints=400, corner_radius=0, threshold=0.01))(image)
+    assert 20 < len(expected) < 400
+    assert len(found) == len(expected)
+    places = np.array([keypoint.pt for keypoint in found])
+    theirs, ours = np.lexsort(np.round(places, 1).T), np.lexsort(np.round(expected.keypoints, 1).T)
+    np.testing.assert_allclose(places[theirs], expected.keypoints[ours], atol=1e-3)
+    np.testing.assert_allclose(descriptors[theirs], expected.descriptors[ours], atol=1e-4)
+    scores = np.array([keypoint.response for keypoint in found])
+    np.testing.assert_allclose(scores[theirs], expected.scores[ours], atol=1e-4)

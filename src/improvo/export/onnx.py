@@ -1,4 +1,4 @@
-"""A network with its decoding as one ONNX file, for programs that use ONNX Runtime without improvo."""
+"""A network with its decoding as one ONNX file, for programs that use ONNX Runtime, or OpenCV 5, without improvo."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from improvo.frontend.settings import NetworkSettings
 from improvo.frontend.weights import Weights
 
 
-def export_onnx(weights: Weights, path: Path, settings: NetworkSettings) -> None:
+def export_onnx(weights: Weights, path: Path, settings: NetworkSettings, layout: str = "improvo") -> None:
     """Write an ONNX model that gives what `NetworkFrontend` gives, for a batch of images of any one size.
 
     Input `image` (batch, 1, height, width) float32 in [0, 1]. Outputs, with N = `settings.max_keypoints`:
     `keypoints` (batch, N, 2) x, y; `scores` (batch, N), best first; `descriptors` (batch, N, D); `stability` (batch, N)
     where there is such a head; `valid` (batch, N) bool, False on the rows past the last keypoint, which mean nothing.
+
+    With the layout `opencv` it is what `cv2.ALIKED` of OpenCV 5 loads (`export/onnx_opencv.py`).
 
     Raises:
         MissingExtraError: the package onnx is not installed.
@@ -29,11 +31,21 @@ def export_onnx(weights: Weights, path: Path, settings: NetworkSettings) -> None
     graph = OnnxGraph("exporting ONNX")
     import onnx
 
-    outputs = _build(graph, without_dead_channels(weights), settings)
-    count, width = settings.max_keypoints, weights.architecture.descriptor
-    tails: dict[str, list[int]] = {"keypoints": [count, 2], "descriptors": [count, width]}
-    shapes = {name: (name == "valid", ["batch", *tails.get(name, [count])]) for name in outputs}
-    model = graph.model(weights.architecture.name, shapes)
+    from improvo.export import onnx_opencv
+
+    width = weights.architecture.descriptor
+    for_opencv = layout == "opencv"
+    image = onnx_opencv.grey(graph) if for_opencv else "image"
+    outputs = _build(graph, without_dead_channels(weights), settings, image)
+    shapes = onnx_opencv.SHAPES if for_opencv else _shapes(settings.max_keypoints)
+    for name, node in (onnx_opencv.outputs(graph, outputs) if for_opencv else outputs).items():
+        graph.node("Identity", node, name=name)
+    described_outputs = {
+        name: (name == "valid", [width if side == "width" else side for side in shapes[name]])
+        for name in (shapes if for_opencv else outputs)
+    }
+    size = [1, 3, "height", "width"] if for_opencv else ["batch", 1, "height", "width"]
+    model = graph.model(weights.architecture.name, described_outputs, size)
     described = {"model_card": config.to_dict(weights.card), "settings": config.to_dict(settings)}
     onnx.helper.set_model_props(model, {name: json.dumps(value) for name, value in described.items()})
     onnx.checker.check_model(model, full_check=True)
@@ -41,14 +53,21 @@ def export_onnx(weights: Weights, path: Path, settings: NetworkSettings) -> None
         onnx.save(model, temporary)
 
 
-def _build(graph: OnnxGraph, weights: Weights, settings: NetworkSettings) -> list[str]:
-    """The whole model; returns the names of its outputs."""
-    size = graph.slice(graph.node("Shape", "image"), [0], graph.constant([2]), graph.constant([4]))  # height, width
+def _shapes(count: int) -> dict[str, tuple[int | str, ...]]:
+    """Of the outputs, by name; `width` is that of a descriptor."""
+    shapes: dict[str, tuple[int | str, ...]] = {"keypoints": ("batch", count, 2)}
+    shapes["descriptors"] = ("batch", count, "width")
+    return shapes | dict.fromkeys(("scores", "stability", "valid"), ("batch", count))
+
+
+def _build(graph: OnnxGraph, weights: Weights, settings: NetworkSettings, image: str) -> dict[str, str]:
+    """The whole model from a grey `image` (batch, 1, height, width); the nodes of its outputs by name."""
+    size = graph.slice(graph.node("Shape", image), [0], graph.constant([2]), graph.constant([4]))  # height, width
     width = graph.slice(size, [0], graph.constant([1]), graph.constant([2]))
     padding = graph.node("Mod", graph.node("Neg", size), graph.constant([CELL]))
     padded_size = graph.node("Add", size, padding)
     pads = graph.node("Concat", graph.constant([0] * 6), padding, axis=0)
-    maps = NetworkNodes(graph, weights).add(graph.node("Pad", "image", pads, mode="edge"))
+    maps = NetworkNodes(graph, weights).add(graph.node("Pad", image, pads, mode="edge"))
 
     heat = graph.slice(add_heat_map(graph, maps["detector"]), [2, 3], graph.constant([0, 0]), size)
     scores, index = _best_pixels(graph, heat, size, settings)
@@ -57,19 +76,15 @@ def _build(graph: OnnxGraph, weights: Weights, settings: NetworkSettings) -> lis
     keypoints = graph.node("Cast", graph.node("Concat", *pixels, axis=2), to=1)
     if settings.subpixel_radius:
         keypoints = graph.node("Add", keypoints, _offsets(graph, heat, size, index, settings.subpixel_radius))
-    graph.node("Identity", keypoints, name="keypoints")
-    graph.node("Identity", scores, name="scores")
-    graph.node("Greater", scores, graph.number(0), name="valid")
-
+    outputs = {"keypoints": str(keypoints), "scores": scores}
     grid = _sampling_grid(graph, keypoints, padded_size)
     cells = graph.node("LpNormalization", maps["descriptor"], axis=1, p=2)
-    graph.node("LpNormalization", _sample(graph, cells, grid), axis=2, p=2, name="descriptors")
-    outputs = ["keypoints", "scores", "descriptors", "valid"]
+    outputs["descriptors"] = graph.node("LpNormalization", _sample(graph, cells, grid), axis=2, p=2)
     if "stability" in maps:
         probabilities = graph.node("Softmax", _sample(graph, maps["stability"], grid), axis=2)
         stable = graph.slice(probabilities, [2], graph.constant([1]), graph.constant([2]))
-        graph.node("Squeeze", stable, graph.constant([2]), name="stability")
-        outputs.insert(3, "stability")
+        outputs["stability"] = graph.node("Squeeze", stable, graph.constant([2]))
+    outputs["valid"] = graph.node("Greater", scores, graph.number(0))
     return outputs
 
 

@@ -23,6 +23,7 @@ from improvo.frontend.weights import FoldedLayer, Weights
 from improvo.types import Float32
 
 OPSET = 17
+IMAGE = ("batch", 1, "height", "width")
 IR_VERSION = 8  # the oldest that holds this opset: readable by ONNX Runtime 1.13 and later
 
 
@@ -67,21 +68,24 @@ class OnnxGraph:
         """A part of a tensor, from the constants `starts` to `ends` along `axes`."""
         return str(self.node("Slice", node, starts, ends, self.constant(np.array(axes))))
 
-    def model(self, name: str, outputs: Mapping[str, tuple[bool, list[Any]]]) -> Any:
-        """The model that turns `image` (batch, 1, height, width) into the outputs.
+    def model(
+        self, name: str, outputs: Mapping[str, tuple[bool, list[Any]]], image: Sequence[int | str] = IMAGE
+    ) -> Any:
+        """The model that turns `image` into the outputs.
 
         Args:
             name: of the graph.
             outputs: by the name of a node's output, whether it is boolean (else float32), and its shape.
+            image: the shape of the input.
         """
         float32, boolean = self._onnx.TensorProto.FLOAT, self._onnx.TensorProto.BOOL
+        given = self._helper.make_tensor_value_info("image", float32, list(image))
         described = [
             self._helper.make_tensor_value_info(output, boolean if is_bool else float32, shape)
             for output, (is_bool, shape) in outputs.items()
         ]
-        image = self._helper.make_tensor_value_info("image", float32, ["batch", 1, "height", "width"])
         return self._helper.make_model(
-            self._helper.make_graph(self.nodes, name, [image], described, self.constants),
+            self._helper.make_graph(self.nodes, name, [given], described, self.constants),
             opset_imports=[self._helper.make_opsetid("", OPSET)],
             ir_version=IR_VERSION,
             producer_name="improvo",

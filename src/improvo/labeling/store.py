@@ -8,6 +8,7 @@
             frames.parquet      frame, index in the recording, time, segment, trusted
             images-00000.parquet ...   with --pack: the frames themselves
             label.json          this sequence's row of the manifest
+            landmarks-*.safetensors   made by training from the tables, see `improvo.training.landmark_files`
 
 A sequence in work lives in `.NAME.partial`; what a killed run leaves there is cleared away by the next one. The
 manifest is made from the folders, so it can be lost without harm.

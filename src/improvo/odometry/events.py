@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+_WORTH_SAYING = 0.03  # share of the keypoints
+
 
 @dataclass(frozen=True)
 class Event:
     """Something the user should know about a frame."""
 
     frame_index: int
-    kind: str  # "initialising", "segment", "lost" or "contradiction"
+    kind: str  # "initialising", "segment", "lost", "contradiction" or "attached"
     detail: str
 
 
@@ -20,6 +22,7 @@ class EventLog:
     def __init__(self) -> None:
         self.events: list[Event] = []
         self._last_failure = ""
+        self._attached_said = 0.0
 
     def segment_started(self, frame_index: int, number: int) -> None:
         """A map has started; the first segment is not worth an event."""
@@ -37,9 +40,16 @@ class EventLog:
         """A frame has no pose, because only `inliers` map points were found in it."""
         self._add(frame_index, "lost", f"only {inliers} points of the map found")
 
-    def contradicted(self, frame_index: int, consequence: str) -> None:
-        """Fresh two-view geometry says that the map is wrong."""
-        self._add(frame_index, "contradiction", f"two-view geometry contradicts the map; {consequence}")
+    def contradicted(self, frame_index: int, consequence: str, by: str = "two-view geometry") -> None:
+        """Something says that the map is wrong."""
+        self._add(frame_index, "contradiction", f"{by} contradicts the map; {consequence}")
+
+    def attached(self, frame_index: int, share: float) -> None:
+        """A share of the keypoints moves with the camera; said again only where it is much larger than before."""
+        if share > max(_WORTH_SAYING, 1.5 * self._attached_said):
+            self._attached_said = share
+            said = f"{share:.0%} of the keypoints stand in the picture while the rest moves; they make no map"
+            self._add(frame_index, "attached", said)
 
     def _add(self, frame_index: int, kind: str, detail: str) -> None:
         self.events.append(Event(frame_index, kind, detail))

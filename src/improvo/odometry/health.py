@@ -18,7 +18,7 @@ from improvo.geometry.camera import Camera
 from improvo.geometry.epipolar import sampson_errors
 from improvo.geometry.ransac import Ransac, relative_pose
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.view import View, ransac_pairs
+from improvo.odometry.view import View, matches_of_world, ransac_pairs
 from improvo.tracking.matching import match_units
 from improvo.types import Int64
 
@@ -95,6 +95,7 @@ def agreement(a: View, b: View, camera: Camera, descriptor_distance: float, sett
     assert a.cam_from_world is not None
     assert b.cam_from_world is not None
     matches = match_units(a.descriptors[:_FEATURES], b.descriptors[:_FEATURES], descriptor_distance)
+    matches = matches_of_world(a, b, matches)
     if len(matches) < 8:
         return Agreement(0, 0, len(matches))
     pixels_a, pixels_b = a.keypoints[matches[:, 0]], b.keypoints[matches[:, 1]]

@@ -11,7 +11,7 @@ from improvo.geometry.epipolar import rotation_residuals
 from improvo.geometry.ransac import Ransac, RobustHomography, homography, motions_of_homography, relative_pose
 from improvo.geometry.triangulation import triangulate_tracks
 from improvo.odometry.settings import OdometrySettings, StartSettings
-from improvo.odometry.view import View, ransac_pairs
+from improvo.odometry.view import View, matches_of_world, ransac_pairs
 from improvo.tracking.matching import match_units
 from improvo.types import Float64, Int64
 
@@ -54,7 +54,7 @@ def initial_pair(
         descriptor_distance: the matching threshold on unit descriptors.
     """
     start = settings.start
-    matches = match_units(a.descriptors, b.descriptors, descriptor_distance)
+    matches = matches_of_world(a, b, match_units(a.descriptors, b.descriptors, descriptor_distance))
     rows_a, rows_b = matches[ransac_pairs(a, b, matches, settings.ransac_gate)].T
     if len(rows_a) < start.min_matches:
         return InitFailure("too few matches")

@@ -76,6 +76,7 @@ class LocalMap:
         view.points[:] = NO_POINT
         rows = earlier.observed
         matches = match_units(earlier.descriptors[rows], view.descriptors, self._descriptor_distance)
+        matches = matches[~view.attached[matches[:, 1]]]
         view.points[matches[:, 1]] = earlier.points[rows[matches[:, 0]]]
 
     def _solve_pose(self, view: View) -> tuple[int, float]:
@@ -104,7 +105,7 @@ class LocalMap:
         assert view.cam_from_world is not None
         ids, descriptors = self._points_to_search(view)
         projections, inside = self.project(view.cam_from_world, self.store.xyz[ids])
-        free = np.flatnonzero(view.points < 0)
+        free = np.flatnonzero((view.points < 0) & ~view.attached)
         pairs = match_by_projection(
             projections[inside],
             descriptors[inside],
@@ -148,9 +149,9 @@ class LocalMap:
         Returns:
             How many points were made.
         """
-        tracks = view.tracks[view.points < 0]
+        tracks = view.tracks[(view.points < 0) & ~view.attached]
         views = [view, *others]
-        seen = [(v, np.flatnonzero(np.isin(v.tracks, tracks) & (v.points < 0))) for v in views]
+        seen = [(v, np.flatnonzero(np.isin(v.tracks, tracks) & (v.points < 0) & ~v.attached)) for v in views]
         track = np.concatenate([v.tracks[rows] for v, rows in seen])
         camera = np.concatenate([np.full(len(rows), i) for i, (_, rows) in enumerate(seen)])
         row = np.concatenate([rows for _, rows in seen])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from improvo.geometry.camera import Camera
+from improvo.odometry.attached import AttachedDetector
 from improvo.odometry.events import EventLog
 from improvo.odometry.health import HealthCheck
 from improvo.odometry.initial_pair import InitFailure
@@ -13,10 +14,11 @@ from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.sliding_window import SlidingWindow
 from improvo.odometry.start import start_map
 from improvo.odometry.states import StateMachine, TrackingState
-from improvo.odometry.view import View
+from improvo.odometry.view import NO_POINT, View
 from improvo.odometry.window import WindowReport, adjust
 from improvo.types import Float64
 
+_CARRIED = 0.2  # share of the observations that turned out to move with the camera; with more the map is wrong
 _FIRST_COOLDOWN = 3  # frames after a costly failure to start; it doubles with each further one
 
 
@@ -37,9 +39,11 @@ class RobustMapper(Mapper):
         self._cooldown = 0  # frames to wait before the next try to start
         self._costly_failures = 0  # since the last map
         self._worlds = 0  # maps started
+        self._carried = False  # a large part of the map has turned out to move with the camera
         self._window = SlidingWindow(settings.window, camera.width)
         self._health = HealthCheck(camera, settings, descriptor_distance)
         self._provisional: list[View] = []  # all views of a provisional map with a pose, in order; none is final
+        self._attached = AttachedDetector(camera, settings, descriptor_distance)
 
     @property
     def state(self) -> TrackingState:
@@ -48,9 +52,14 @@ class RobustMapper(Mapper):
 
     def track(self, view: View) -> None:
         """One frame: localise, triangulate, adjust the window, check, slide."""
+        newly_attached = self._attached.observe(view)
         if self._map is None:
+            if newly_attached:
+                self._leave_out_attached(view, self._buffer)
             self._initialise(view)
             return
+        if newly_attached and self._leave_out_attached(view, [*self._map.history, *self._buffer]) > _CARRIED:
+            self._carried = True
         inliers, _ = self._map.localise(view, self._window.newest)
         if view.cam_from_world is None:
             self._lose(view, inliers)
@@ -61,8 +70,11 @@ class RobustMapper(Mapper):
         report = self._adjust_window(self._map)
         self._map.remember(view)
         self._result.add_window(report)
+        if self._carried:
+            self._start_anew(view, "what moves with the camera")
+            return
         if self._health.contradicts(view, {earlier.frame_index: earlier for earlier in self._map.history}):
-            self._start_anew(view)
+            self._start_anew(view, "two-view geometry")
             return
         self._confirm()
         self._slide()
@@ -150,17 +162,27 @@ class RobustMapper(Mapper):
             for view, cam_from_world in self._window.take_final():
                 self._finalise(self._map, view, cam_from_world)
 
-    def _start_anew(self, view: View) -> None:
+    def _leave_out_attached(self, view: View, views: list[View]) -> float:
+        """Mark earlier views anew, and drop what they observe there; returns its share of all that they observed."""
+        self._attached.mark(views)
+        self._events.attached(view.frame_index, float(view.attached.mean()) if len(view) else 0.0)
+        observed = [each.points >= 0 for each in views]
+        dropped = sum(int((each.attached & seen).sum()) for each, seen in zip(views, observed, strict=True))
+        for each in views:
+            each.points[each.attached] = NO_POINT
+        return dropped / max(sum(int(seen.sum()) for seen in observed), 1)
+
+    def _start_anew(self, view: View, by: str) -> None:
         """The map is wrong: a provisional one starts anew over all its frames, another one over its last frames."""
         if self._states.is_provisional:
-            self._events.contradicted(view.frame_index, "the map is started anew")
+            self._events.contradicted(view.frame_index, "the map is started anew", by)
             self._buffer = self._provisional
             self._clear()
             self._states.map_ended()
         else:
-            self._events.contradicted(view.frame_index, "the segment ends")
+            self._events.contradicted(view.frame_index, "the segment ends", by)
             doubtful, self._window.recent = self._window.recent, []
-            self._end_segment("contradicted by two-view geometry")
+            self._end_segment(f"contradicted by {by}")
             self._buffer = doubtful
         for each in self._buffer:
             each.forget_pose()
@@ -214,3 +236,4 @@ class RobustMapper(Mapper):
         self._window = SlidingWindow(self._settings.window, self._camera.width)
         self._provisional = []
         self._cooldown, self._costly_failures = 0, 0
+        self._carried = False

@@ -91,6 +91,20 @@ class HealthSettings:
 
 
 @dataclass(frozen=True)
+class AttachedSettings:
+    """What moves with the camera, such as a logo, is kept out of the map (see `improvo.odometry.attached`)."""
+
+    enabled: bool = True
+    noise: float = 1.5  # pixels (of a width of 640, or less) that a keypoint of something attached may move
+    min_flow: float = 4.0  # times the noise: median motion of what moves, before two views are compared
+    min_moving_cells: float = 0.4  # share of the picture's cells that moves; less may be a person before a still camera
+
+    def __post_init__(self) -> None:
+        if not (self.noise > 0 and self.min_flow >= 3 and 0 < self.min_moving_cells < 1):
+            raise ConfigError("attached: noise must be positive, min_flow at least 3, min_moving_cells within 0 and 1")
+
+
+@dataclass(frozen=True)
 class RansacGateSettings:
     """Which keypoints a RANSAC may sample, by their stability (docs/odometry.md, "Stability")."""
 
@@ -114,6 +128,7 @@ class OdometrySettings:
     window: WindowSettings = field(default_factory=WindowSettings)
     loss: TrackingLossSettings = field(default_factory=TrackingLossSettings)
     health: HealthSettings = field(default_factory=HealthSettings)
+    attached: AttachedSettings = field(default_factory=AttachedSettings)
     objective: ObjectiveSettings = field(default_factory=lambda: ObjectiveSettings(depth_weight=0.0))
     solver: SolverSettings = field(default_factory=lambda: SolverSettings(max_iterations=8, relative_decrease=1e-3))
     paper_objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)  # of the mode `paper`
