@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from improvo.odometry.bridging import Join
+from improvo.odometry.segments import Segment
+from improvo.odometry.verdict import DOUBTFUL
+
 
 @dataclass(frozen=True)
 class Event:
     """Something the user should know about a frame."""
 
     frame_index: int
-    kind: str  # "initialising", "segment", "lost" or "contradiction"
+    kind: str  # "initialising", "segment", "lost", "contradiction", "bridged", "uncertain" or "doubtful"
     detail: str
 
 
@@ -40,6 +44,20 @@ class EventLog:
     def contradicted(self, frame_index: int, consequence: str) -> None:
         """Fresh two-view geometry says that the map is wrong."""
         self._add(frame_index, "contradiction", f"two-view geometry contradicts the map; {consequence}")
+
+    def bridged(self, frame_index: int, join: Join) -> None:
+        """The running map lies in the world of a segment that ended before."""
+        scale = f"scale ±{100 * join.scale_error:.1g} %"
+        self._add(
+            frame_index, "bridged", f"joined with segment {join.number + 1}: {join.points} of its points found, {scale}"
+        )
+
+    def judged(self, segment: Segment) -> None:
+        """A segment has ended; only what a user should know of its verdict is an event."""
+        for first, last in segment.verdict.uncertain:
+            self._add(first, "uncertain", f"the scale is not determined between frames {first} and {last}")
+        if segment.verdict.word == DOUBTFUL:
+            self._add(segment.last, "doubtful", f"segment {segment.number + 1}: {segment.verdict.evidence[0]}")
 
     def _add(self, frame_index: int, kind: str, detail: str) -> None:
         self.events.append(Event(frame_index, kind, detail))

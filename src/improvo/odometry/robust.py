@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from improvo.geometry.camera import Camera
+from improvo.odometry.bridging import Bridging
 from improvo.odometry.events import EventLog
+from improvo.odometry.evidence import EvidenceCheck
+from improvo.odometry.former_map import FormerMap
 from improvo.odometry.health import HealthCheck
 from improvo.odometry.initial_pair import InitFailure
 from improvo.odometry.local_map import LocalMap
@@ -13,11 +16,14 @@ from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.sliding_window import SlidingWindow
 from improvo.odometry.start import start_map
 from improvo.odometry.states import StateMachine, TrackingState
+from improvo.odometry.verdict import judge
 from improvo.odometry.view import View
 from improvo.odometry.window import WindowReport, adjust
 from improvo.types import Float64
 
 _FIRST_COOLDOWN = 3  # frames after a costly failure to start; it doubles with each further one
+
+_LOST = "lost"  # why a segment ended
 
 
 class RobustMapper(Mapper):
@@ -39,6 +45,8 @@ class RobustMapper(Mapper):
         self._worlds = 0  # maps started
         self._window = SlidingWindow(settings.window, camera.width)
         self._health = HealthCheck(camera, settings, descriptor_distance)
+        self._evidence = EvidenceCheck(camera, settings.verdict, settings.objective)
+        self._bridging = Bridging(settings.bridging)
         self._provisional: list[View] = []  # all views of a provisional map with a pose, in order; none is final
 
     @property
@@ -64,6 +72,7 @@ class RobustMapper(Mapper):
         if self._health.contradicts(view, {earlier.frame_index: earlier for earlier in self._map.history}):
             self._start_anew(view)
             return
+        self._bridge(self._map, [view])
         self._confirm()
         self._slide()
 
@@ -107,9 +116,11 @@ class RobustMapper(Mapper):
         self._result.begin_segment()
         self._result.give_up(each for each in self._buffer if each.cam_from_world is None)
         self._health = HealthCheck(self._camera, self._settings, self._descriptor_distance)
+        self._bridging.new_map()
         for each in self._buffer:
             if each.cam_from_world is not None:
                 self._add(each)
+        self._bridge(self._map, self._buffer)
         self._buffer = []
         self._slide()
 
@@ -144,6 +155,20 @@ class RobustMapper(Mapper):
             self._states.map_confirmed()
             self._provisional = []
 
+    def _bridge(self, local_map: LocalMap, views: list[View]) -> None:
+        """Join a provisional map with a former one that its keyframes see; nothing of it is final yet."""
+        if not self._states.is_provisional:
+            return
+        for view in views:
+            join = self._bridging.look(view, local_map.store.xyz) if view.keyframe else None
+            if join is None:
+                continue
+            self._result.join(join.number, join.shared_from_new, join.scale_error)
+            self._events.bridged(view.frame_index, join)
+            for each in self._provisional:
+                each.segment = join.number
+            return
+
     def _slide(self) -> None:
         self._window.slide()
         if self._map is not None and not self._states.is_provisional:
@@ -174,7 +199,7 @@ class RobustMapper(Mapper):
         self._buffer.append(view)
         self._events.lost(view.frame_index, inliers)
         if len(self._buffer) > self._settings.loss.max_lost_frames:
-            self._end_segment("lost")
+            self._end_segment(_LOST)
 
     def _recover_lost_frames(self, local_map: LocalMap, view: View) -> None:
         """Frames lost just before `view` get their pose backwards from it, where they can."""
@@ -200,17 +225,42 @@ class RobustMapper(Mapper):
         assert self._map is not None
         for view, cam_from_world in self._window.remaining():
             self._finalise(self._map, view, cam_from_world)
-        self._result.end_segment(self._map.store.xyz, reason)
+        xyz = self._map.store.xyz
+        self._remember_former_map(self._map, reason)
+        verdict = judge(self._evidence.finish(xyz), self._settings.verdict)
+        segment = self._result.end_segment(xyz, reason, verdict)
+        if segment is not None:
+            self._events.judged(segment)
         self._clear()
         self._states.map_ended()
 
+    def _remember_former_map(self, local_map: LocalMap, reason: str) -> None:
+        """What a later map may be joined with; a map that was contradicted is none."""
+        if reason != _LOST:
+            return
+        settings = self._settings
+        former = FormerMap(
+            self._result.running_segment,
+            self._result.placement,
+            sorted({*self._window.keyframes, *local_map.history}, key=lambda view: view.frame_index),
+            local_map.store.xyz,
+            self._camera,
+            self._descriptor_distance,
+            settings.window.max_error,
+            settings.seed,
+        )
+        self._bridging.remember(former)
+
     def _finalise(self, local_map: LocalMap, view: View, cam_from_world: Float64) -> None:
         view.cam_from_world = cam_from_world
+        if view.keyframe:
+            self._evidence.add(view, cam_from_world, local_map.store.xyz)
         self._result.finalise(view, cam_from_world, local_map.store.xyz)
 
     def _clear(self) -> None:
         """No map."""
         self._map = None
+        self._evidence = EvidenceCheck(self._camera, self._settings.verdict, self._settings.objective)
         self._window = SlidingWindow(self._settings.window, self._camera.width)
         self._provisional = []
         self._cooldown, self._costly_failures = 0, 0
