@@ -151,6 +151,30 @@ def sampson_errors(b_from_a: Float64, camera: Camera, pixels_a: Float64, pixels_
     return focal * np.abs(algebraic) / np.sqrt(np.maximum(slope, 1e-18))
 
 
+def half_line_distances(b_from_a: Float64, camera: Camera, pixels_a: Float64, pixels_b: Float64) -> Float64:
+    """Pixels (N,) between a match in the second view and where its point can be seen there at any depth.
+
+    That is the half of the epipolar line that begins where the point would be at infinity. So a match on the line but
+    beyond infinity, with a negative depth, is as far off as it is from there.
+
+    Args:
+        b_from_a: (4, 4).
+        camera: pinhole, of both views.
+        pixels_a: (N, 2) pixels in the first view.
+        pixels_b: (N, 2) pixels in the second view.
+    """
+    far = camera.unproject(pixels_a) @ b_from_a[:3, :3].T
+    far /= np.maximum(far[:, 2:], 1e-6)
+    t = b_from_a[:3, 3]
+    nearer = np.stack([camera.fx * (t[0] - far[:, 0] * t[2]), camera.fy * (t[1] - far[:, 1] * t[2])], axis=1)
+    nearer /= np.maximum(np.linalg.norm(nearer, axis=1, keepdims=True), 1e-12)
+    offset = pixels_b - camera.project(far)
+    along = (offset * nearer).sum(axis=1)
+    across = np.abs(offset[:, 0] * nearer[:, 1] - offset[:, 1] * nearer[:, 0])
+    distances: Float64 = np.where(along >= 0, across, np.linalg.norm(offset, axis=1))
+    return distances
+
+
 def epipolar_lines(b_from_a: Float64, camera: Camera, pixels_a: Float64) -> Float64:
     """Lines (N, 3) in the second view on which the pixels of the first lie: u x + v y + w = 0 in pixels.
 

@@ -43,22 +43,22 @@ class Verdict:
         }
 
 
-def judge(spread: Spread | None, settings: VerdictSettings) -> Verdict:
-    """The verdict of a segment by the spread of its path.
+def judge(spread: Spread | None, settings: VerdictSettings, alarms: tuple[str, ...] = ()) -> Verdict:
+    """The verdict of a segment by the spread of its path, and by what else was seen.
 
     Args:
         spread: of the paths from the parts of the evidence; None where the segment is too short for one.
         settings: the limits.
+        alarms: in plain words; each makes the segment doubtful.
     """
     if spread is None:
-        return Verdict(NOT_JUDGED, evidence=("too few keyframes to judge the path",))
+        return Verdict(DOUBTFUL if alarms else NOT_JUDGED, evidence=(*alarms, "too few keyframes to judge the path"))
     error = estimated_error(spread, settings)
     uncertain = _uncertain(spread, settings)
-    evidence = [_in_words(spread, error, settings)]
+    evidence = [*alarms, _in_words(spread, error, settings)]
     evidence += [f"frames {first} to {last}: the scale is not determined" for first, last in uncertain]
-    return Verdict(
-        RIGHT if error <= settings.max_error else DOUBTFUL, error, spread.noise_px, tuple(evidence), uncertain
-    )
+    word = RIGHT if error <= settings.max_error and not alarms else DOUBTFUL
+    return Verdict(word, error, spread.noise_px, tuple(evidence), uncertain)
 
 
 def joined(first: Verdict, second: Verdict, scale_error: float) -> Verdict:
