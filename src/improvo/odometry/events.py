@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from improvo.odometry.bridging import Join
+from improvo.odometry.segments import Segment
+from improvo.odometry.verdict import DOUBTFUL
+
 _WORTH_SAYING = 0.03  # share of the keypoints
 _SAID_AGAIN = 20  # frames
 
@@ -13,7 +17,9 @@ class Event:
     """Something the user should know about a frame."""
 
     frame_index: int
-    kind: str  # "initialising", "segment", "lost", "contradiction", "attached", "two motions" or "focal length"
+    # "initialising", "segment", "lost", "contradiction", "bridged", "uncertain", "doubtful", "attached", "two motions"
+    # or "focal length"
+    kind: str
     detail: str
 
 
@@ -63,6 +69,20 @@ class EventLog:
             self._attached_said = share
             said = f"{share:.0%} of the keypoints stand in the picture while the rest moves; they make no map"
             self._add(frame_index, "attached", said)
+
+    def bridged(self, frame_index: int, join: Join) -> None:
+        """The running map lies in the world of a segment that ended before."""
+        scale = f"scale ±{100 * join.scale_error:.1g} %"
+        self._add(
+            frame_index, "bridged", f"joined with segment {join.number + 1}: {join.points} of its points found, {scale}"
+        )
+
+    def judged(self, segment: Segment) -> None:
+        """A segment has ended; only what a user should know of its verdict is an event."""
+        for first, last in segment.verdict.uncertain:
+            self._add(first, "uncertain", f"the scale is not determined between frames {first} and {last}")
+        if segment.verdict.word == DOUBTFUL:
+            self._add(segment.last, "doubtful", f"segment {segment.number + 1}: {segment.verdict.evidence[0]}")
 
     def _add(self, frame_index: int, kind: str, detail: str) -> None:
         self.events.append(Event(frame_index, kind, detail))

@@ -84,7 +84,7 @@ class LocalMap:
         xyz = self.store.xyz[view.points[view.observed]]
         if len(xyz) == 0:
             return False
-        rays = [xyz - se3.inverse(each.cam_from_world)[:3, 3] for each in (view, other)]
+        rays = [xyz - se3.inverse(pose)[:3, 3] for pose in (view.cam_from_world, other.cam_from_world)]
         cosine = (rays[0] * rays[1]).sum(axis=1) / np.maximum(np.prod(np.linalg.norm(rays, axis=2), axis=0), 1e-12)
         return bool(np.median(cosine) > _SAME_SIDE)
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from improvo.geometry.camera import Camera
 from improvo.odometry.attached import AttachedDetector
+from improvo.odometry.bridging import Bridging
 from improvo.odometry.events import EventLog
 from improvo.odometry.focal_change import focal_change
+from improvo.odometry.former_map import FormerMap
 from improvo.odometry.health import HealthCheck
 from improvo.odometry.initial_pair import InitFailure
+from improvo.odometry.judging import SegmentJudge
 from improvo.odometry.local_map import LocalMap
 from improvo.odometry.mapper import Mapper
 from improvo.odometry.result import OdometryResult
@@ -22,6 +25,7 @@ from improvo.types import Float64
 _CARRIED = 0.2  # share of the observations that turned out to move with the camera; with more the map is wrong
 _SAME_LENS = 0.05  # relative change of the focal length that is none
 _FIRST_COOLDOWN = 3  # frames after a costly failure to start; it doubles with each further one
+_LOST = "lost"  # why a segment ended
 
 
 class RobustMapper(Mapper):
@@ -45,6 +49,8 @@ class RobustMapper(Mapper):
         self._carried = False  # a large part of the map has turned out to move with the camera
         self._window = SlidingWindow(settings.window, camera.width)
         self._health = HealthCheck(camera, settings, descriptor_distance)
+        self._judge = SegmentJudge(camera, settings)
+        self._bridging = Bridging(settings.bridging)
         self._provisional: list[View] = []  # all views of a provisional map with a pose, in order; none is final
         self._attached = AttachedDetector(camera, settings, descriptor_distance)
 
@@ -85,6 +91,8 @@ class RobustMapper(Mapper):
             return
         if self._health.ambiguous:
             self._events.two_motions(view.frame_index)
+            self._judge.alarm("two motions are in the picture, and one of them is not the camera's")
+        self._bridge(self._map, [view])
         self._confirm()
         self._slide()
 
@@ -127,12 +135,15 @@ class RobustMapper(Mapper):
         self._events.segment_started(self._buffer[0].frame_index, self._result.running_segment)
         if self._focal_factor != 1.0:
             self._events.focal_length(self._buffer[0].frame_index, self._focal_factor, "the segment is doubtful")
+            self._judge.alarm(f"the focal length is about {self._focal_factor:.2f} times that of the camera as given")
         self._result.begin_segment()
         self._result.give_up(each for each in self._buffer if each.cam_from_world is None)
         self._health = HealthCheck(self._camera, self._settings, self._descriptor_distance)
+        self._bridging.new_map()
         for each in self._buffer:
             if each.cam_from_world is not None:
                 self._add(each)
+        self._bridge(self._map, self._buffer)
         self._buffer = []
         self._slide()
 
@@ -166,6 +177,20 @@ class RobustMapper(Mapper):
         if self._states.is_provisional and len(self._provisional) > self._settings.health.provisional_frames:
             self._states.map_confirmed()
             self._provisional = []
+
+    def _bridge(self, local_map: LocalMap, views: list[View]) -> None:
+        """Join a provisional map with a former one that its keyframes see; nothing of it is final yet."""
+        if not self._states.is_provisional:
+            return
+        for view in views:
+            join = self._bridging.look(view, local_map.store.xyz) if view.keyframe else None
+            if join is None:
+                continue
+            self._result.join(join.number, join.shared_from_new, join.scale_error)
+            self._events.bridged(view.frame_index, join)
+            for each in self._provisional:
+                each.segment = join.number
+            return
 
     def _slide(self) -> None:
         self._window.slide()
@@ -221,7 +246,7 @@ class RobustMapper(Mapper):
         self._buffer.append(view)
         self._events.lost(view.frame_index, inliers)
         if len(self._buffer) > self._settings.loss.max_lost_frames:
-            self._end_segment("lost")
+            self._end_segment(_LOST)
 
     def _recover_lost_frames(self, local_map: LocalMap, view: View) -> None:
         """Frames lost just before `view` get their pose backwards from it, where they can."""
@@ -247,17 +272,40 @@ class RobustMapper(Mapper):
         assert self._map is not None
         for view, cam_from_world in self._window.remaining():
             self._finalise(self._map, view, cam_from_world)
-        self._result.end_segment(self._map.store.xyz, reason)
+        xyz = self._map.store.xyz
+        self._remember_former_map(self._map, reason)
+        segment = self._result.end_segment(xyz, reason, self._judge.verdict(xyz))
+        if segment is not None:
+            self._events.judged(segment)
         self._clear()
         self._states.map_ended()
 
+    def _remember_former_map(self, local_map: LocalMap, reason: str) -> None:
+        """What a later map may be joined with; a map that was contradicted is none."""
+        if reason != _LOST:
+            return
+        settings = self._settings
+        former = FormerMap(
+            self._result.running_segment,
+            self._result.placement,
+            sorted({*self._window.keyframes, *local_map.history}, key=lambda view: view.frame_index),
+            local_map.store.xyz,
+            self._camera,
+            self._descriptor_distance,
+            settings.window.max_error,
+            settings.seed,
+        )
+        self._bridging.remember(former)
+
     def _finalise(self, local_map: LocalMap, view: View, cam_from_world: Float64) -> None:
         view.cam_from_world = cam_from_world
+        self._judge.final(view, cam_from_world, local_map.store.xyz)
         self._result.finalise(view, cam_from_world, local_map.store.xyz)
 
     def _clear(self) -> None:
         """No map."""
         self._map = None
+        self._judge = SegmentJudge(self._camera, self._settings)
         self._window = SlidingWindow(self._settings.window, self._camera.width)
         self._provisional = []
         self._cooldown, self._costly_failures = 0, 0

@@ -183,7 +183,14 @@ def _report(
             "lost_frames": np.flatnonzero(~has_pose).tolist(),
             "source_index": processed,
         },
-        "segments": [{**asdict(segment), "mean_error": _number(segment.mean_error)} for segment in odometry.segments],
+        "segments": [
+            {
+                **asdict(segment),
+                "mean_error": _number(segment.mean_error),
+                "verdict": segment.verdict.report(),
+            }
+            for segment in odometry.segments
+        ],
         "events": [asdict(event) for event in odometry.events],
         "points": len(odometry.map),
         "tracks": dict(tracks),

@@ -93,6 +93,36 @@ class HealthSettings:
 
 
 @dataclass(frozen=True)
+class VerdictSettings:
+    """When a segment's path is believed (see `improvo.odometry.evidence` and `improvo.odometry.verdict`)."""
+
+    window: int = 12  # keyframes that are adjusted together from each part of the evidence; half of them overlap
+    # What a change of scale between two windows moves the path by: % of it for a change by the factor e. Calibrated on
+    # simulated and real recordings with truth (docs/odometry.md).
+    scale_share: float = 40.0
+    max_error: float = 5.0  # % of the path; a larger estimated error makes a segment doubtful
+    max_scale_error: float = 0.1  # of the logarithm of the scale between two windows; more is an uncertain stretch
+
+    def __post_init__(self) -> None:
+        if self.window < 4:
+            raise ConfigError(f"verdict.window={self.window}: must be at least 4 keyframes")
+        if not self.max_error > 0:
+            raise ConfigError(f"verdict.max_error={self.max_error}: must be positive, % of the path")
+
+
+@dataclass(frozen=True)
+class BridgingSettings:
+    """When a new map is joined with that of a segment that ended before (see `improvo.odometry.bridging`)."""
+
+    max_frames: int = 300  # since the former segment's last frame; 0 joins nothing
+    max_scale_error: float = 0.05  # standard error of the scale between both, relative
+
+    def __post_init__(self) -> None:
+        if self.max_frames < 0:
+            raise ConfigError(f"bridging.max_frames={self.max_frames}: must not be negative (0 joins nothing)")
+
+
+@dataclass(frozen=True)
 class AttachedSettings:
     """What moves with the camera, such as a logo, is kept out of the map (see `improvo.odometry.attached`)."""
 
@@ -130,6 +160,8 @@ class OdometrySettings:
     window: WindowSettings = field(default_factory=WindowSettings)
     loss: TrackingLossSettings = field(default_factory=TrackingLossSettings)
     health: HealthSettings = field(default_factory=HealthSettings)
+    verdict: VerdictSettings = field(default_factory=VerdictSettings)
+    bridging: BridgingSettings = field(default_factory=BridgingSettings)
     attached: AttachedSettings = field(default_factory=AttachedSettings)
     objective: ObjectiveSettings = field(default_factory=lambda: ObjectiveSettings(depth_weight=0.0))
     solver: SolverSettings = field(default_factory=lambda: SolverSettings(max_iterations=8, relative_decrease=1e-3))

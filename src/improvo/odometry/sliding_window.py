@@ -33,6 +33,11 @@ class SlidingWindow:
         return self.recent[-1]
 
     @property
+    def keyframes(self) -> list[View]:
+        """Older keyframes, in temporal order; their observations still count."""
+        return list(self._keyframes)
+
+    @property
     def free(self) -> list[View]:
         """Views whose poses are adjusted, in temporal order."""
         return [*self._keyframes[-self._settings.keyframes :], *self.recent]
