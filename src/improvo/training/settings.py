@@ -240,7 +240,7 @@ class OdometryTrainingSettings:
     """`improvo train odometry`: VO adaptation, from label stores (paper, "Training Details")."""
 
     longer_side: int = 320  # pixels; larger frames are reduced on loading
-    memory_mib: int = 256  # of labelled sequences that are kept open, in each process that prepares batches
+    memory_mib: int = 64  # of labelled sequences that are kept open, in each process that prepares batches
     detector_weight: float = 0.3
     descriptor_weight: float = 1.0
     stability_weight: float = 1.0
