@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from improvo.sequences import Sequence
 
 _WARNINGS = 5  # printed; run.json has them all
+_UNSAID = ("initialising", "segment", "doubtful", "uncertain")  # kinds of events that other lines say
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -195,6 +196,7 @@ def _scale_lines(report: dict[str, Any]) -> list[str]:
 
 def _print_summary(summary: LabeledRun) -> None:
     from improvo.odometry.run_folder import why_no_pose
+    from improvo.odometry.told_verdicts import verdict_lines
 
     report = summary.report
     frames, segments = report["frames"], report["segments"]
@@ -205,9 +207,9 @@ def _print_summary(summary: LabeledRun) -> None:
     for segment in segments[1:] if len(segments) > 1 else []:
         own = "" if report.get("metric") else "own scale, "
         say(f"  segment {segment['number']} starts at frame {segment['first']}: {own}placed by guess")
-    for line in _scale_lines(report):
+    for line in [*verdict_lines(report), *_scale_lines(report)]:
         say(f"  {line}")
-    warnings = [event for event in report["events"] if event["kind"] in ("lost", "contradiction")]
+    warnings = [event for event in report["events"] if event["kind"] not in _UNSAID]
     for event in warnings[:_WARNINGS]:
         say(f"  frame {event['frame_index']}: {event['kind']}: {event['detail']}")
     if len(warnings) > _WARNINGS:

@@ -17,6 +17,7 @@ import numpy as np
 from improvo.files import write_json
 from improvo.labeling.quality import FrameQuality, assess_frames, withhold_labels
 from improvo.odometry.run import RunSummary, run_odometry
+from improvo.odometry.told_verdicts import doubtful_frames
 from improvo.stability.settings import LabelSettings
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, PointsWriter, read_points, read_tracks
 
@@ -78,7 +79,9 @@ def apply_quality_gate(run: RunSummary, settings: LabelSettings) -> LabeledRun:
     points, tracks = read_points(run.folder / POINTS_FILE), read_tracks(run.folder / TRACKS_FILE)
     alarms = [event["frame_index"] for event in run.report["events"] if event["kind"] == "contradiction"]
     trajectory = run.trajectory
-    quality = assess_frames(tracks, points, trajectory.valid, np.array(alarms, np.int64), settings, trajectory.segment)
+    segment = trajectory.segment
+    doubtful = doubtful_frames(run.report, segment)
+    quality = assess_frames(tracks, points, trajectory.valid, np.array(alarms, np.int64), settings, segment, doubtful)
     if settings.quality.enabled:
         points = withhold_labels(points, tracks, quality.trusted, settings)
     with PointsWriter(run.folder / POINTS_FILE) as writer:

@@ -1,8 +1,9 @@
 """The quality gate, which the paper does not have: no labels where the odometry itself is not to be trusted.
 
 A large error says "unstable point" only if the pose is right. A small one says "stable point" only if the camera's
-motion could have contradicted it. So four kinds of frames are not trusted: frames without a pose, frames that all their
-long tracks fit badly, frames of little parallax, and frames before an alarm of the odometry. A track that lives mostly
+motion could have contradicted it. So five kinds of frames are not trusted: frames without a pose, frames that all their
+long tracks fit badly, frames of little parallax, frames before an alarm of the odometry, and frames of a segment whose
+verdict is `doubtful`. A track that lives mostly
 in such frames keeps its errors, but its label is withheld.
 """
 
@@ -30,11 +31,12 @@ class FrameQuality:
     high_error: Mask  # (F,)
     little_parallax: Mask  # (F,)
     contradicted: Mask  # (F,)
+    doubtful: Mask  # (F,) the odometry does not believe the path of its segment
 
     @property
     def trusted(self) -> Mask:
         """(F,) no reason against it."""
-        return ~(self.no_pose | self.high_error | self.little_parallax | self.contradicted)
+        return ~(self.no_pose | self.high_error | self.little_parallax | self.contradicted | self.doubtful)
 
     def counts(self) -> dict[str, int]:
         """Frames per reason, and in all."""
@@ -49,6 +51,7 @@ def assess_frames(
     contradictions: Int64,
     settings: LabelSettings,
     segment: Int64 | None = None,
+    doubtful: Mask | None = None,
 ) -> FrameQuality:
     """Assess every frame of a finished sequence.
 
@@ -60,6 +63,7 @@ def assess_frames(
         settings: of the labels; `settings.quality` has the limits.
         segment: (F,) final segment of each frame, -1 without a pose. After a contradiction the odometry starts a map
             anew over frames that have misled it once, so all from the segment's first frame on are doubted.
+        doubtful: (F,) frames of segments with a doubtful verdict; None: there are none.
     """
     limits = settings.quality
     frames = len(has_pose)
@@ -79,6 +83,7 @@ def assess_frames(
         high_error=error > limits.max_median_error,
         little_parallax=parallax < limits.min_median_parallax_deg,
         contradicted=contradicted,
+        doubtful=np.zeros(frames, np.bool_) if doubtful is None else doubtful,
     )
 
 

@@ -17,6 +17,8 @@ from improvo.geometry.camera import Camera
 from improvo.geometry.trajectory_files import read_trajectory
 from improvo.odometry.map_file import read_map
 from improvo.odometry.run import unit_of
+from improvo.odometry.told_verdicts import doubtful_frames, uncertain_frames
+from improvo.odometry.view import Mask
 from improvo.sequences import Sequence, SequenceSettings, open_sequence
 from improvo.stability.rule import IGNORE
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
@@ -114,6 +116,16 @@ class RunFolder:
                 "run again"
             )
         return frame_indices
+
+    @cached_property
+    def doubtful(self) -> Mask:
+        """(N,) whether the verdict of the segment is doubtful, for each row of `trajectory`."""
+        return doubtful_frames(self.report, self.trajectory.segment)
+
+    @cached_property
+    def uncertain(self) -> Mask:
+        """(N,) whether the scale is not determined there, for each row of `trajectory`."""
+        return uncertain_frames(self.report, self.frame_indices)
 
     @cached_property
     def map(self) -> SparseMap:
