@@ -90,13 +90,14 @@ class AttachedDetector:
         """With the anchor, where the picture moved enough since then; then this view is the anchor."""
         anchor = self._anchor
         if anchor is not None and view.frame_index - anchor.frame_index <= _LONGEST:
-            early = view.frame_index - anchor.frame_index < _SHORTEST
+            # a track that is not younger than the anchor was seen in it, since tracks have no gaps
+            few_left = (view.tracks <= anchor.tracks.max(initial=-1)).sum() < 2 * _MIN_MOVING
+            if not few_left and view.frame_index - anchor.frame_index < _SHORTEST:
+                return
             rows, rows_anchor = common_tracks(view, anchor)
             motion = np.linalg.norm(view.keypoints[rows] - anchor.keypoints[rows_anchor], axis=1)
             moved = motion[motion > _MOVED * self._noise]
-            few_left = len(rows) < 2 * _MIN_MOVING
-            too_few = early or len(moved) < _MIN_MOVING
-            if not few_left and (too_few or np.median(moved) < self._settings.min_flow * self._noise):
+            if not few_left and (len(moved) < _MIN_MOVING or np.median(moved) < self._settings.min_flow * self._noise):
                 return
             self._weigh(anchor, view)
         self._anchor = view
