@@ -16,7 +16,8 @@ import numpy as np
 
 from improvo.geometry.a_contrario import line_probability, log10_false_alarms
 from improvo.geometry.camera import Camera
-from improvo.geometry.two_view import Ransac, half_line_distances, relative_pose
+from improvo.geometry.epipolar import half_line_distances
+from improvo.geometry.ransac import Ransac, relative_pose
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import Mask, View, common_tracks
 from improvo.tracking.matching import match_units

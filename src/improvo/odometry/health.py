@@ -15,7 +15,8 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.geometry.two_view import Ransac, relative_pose, sampson_errors
+from improvo.geometry.epipolar import sampson_errors
+from improvo.geometry.ransac import Ransac, relative_pose
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.two_motions import holds_beside
 from improvo.odometry.view import View, matches_of_world, ransac_pairs

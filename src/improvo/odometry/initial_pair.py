@@ -7,15 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from improvo.geometry.camera import Camera
+from improvo.geometry.epipolar import rotation_residuals
+from improvo.geometry.ransac import Ransac, RobustHomography, homography, motions_of_homography, relative_pose
 from improvo.geometry.triangulation import triangulate_tracks
-from improvo.geometry.two_view import (
-    Ransac,
-    RobustHomography,
-    homography,
-    motions_of_homography,
-    relative_pose,
-    rotation_residuals,
-)
 from improvo.odometry.settings import OdometrySettings, StartSettings
 from improvo.odometry.two_motions import has_second_motion
 from improvo.odometry.view import View, matches_of_world, ransac_pairs

@@ -9,8 +9,8 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
+from improvo.geometry.ransac import Ransac, absolute_pose
 from improvo.geometry.triangulation import triangulate_tracks
-from improvo.geometry.two_view import Ransac, absolute_pose
 from improvo.odometry.projection_search import match_by_projection
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_points, ransac_rows
