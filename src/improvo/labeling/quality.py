@@ -117,7 +117,7 @@ def assess_frames(
         high_error=median_error > limits.max_median_error,
         little_parallax=median_parallax_deg < limits.min_median_parallax_deg,
         contradicted=contradicted,
-        doubtful=np.zeros(frames, np.bool_) if doubtful is None else doubtful,
+        doubtful=np.zeros_like(contradicted) if doubtful is None else doubtful,
     )
 
 
