@@ -3,8 +3,7 @@
 A large error says "unstable point" only if the pose is right. A small one says "stable point" only if the camera's
 motion could have contradicted it. So five kinds of frames are not trusted: frames without a pose, frames that all their
 long tracks fit badly, frames of little parallax, frames before an alarm of the odometry, and frames of a segment whose
-verdict is `doubtful`. A track that lives mostly
-in such frames keeps its errors, but its label is withheld.
+verdict is `doubtful`. A track that lives mostly in such frames keeps its errors, but its label is withheld.
 
 Observations are looked at a part at a time, so that memory does not grow with them; a number for each frame and for
 each track is kept.
