@@ -25,7 +25,7 @@ FLOORS = (
     {"sequences", "calibration", "frontend", "tracking", "simulation"},
     {"stability", "backend"},
     {"odometry"},
-    {"labeling", "depth"},
+    {"labeling", "depth", "self_calibration"},
     {"training"},
     {"evaluation"},
     {"report", "export"},

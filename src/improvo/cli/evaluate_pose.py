@@ -13,6 +13,7 @@ import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments, add_truth_argument
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
 from improvo.cli.output import figures, next_step, say
@@ -167,6 +168,8 @@ def _settings(arguments: argparse.Namespace) -> tuple[PoseSettings, list[Recorde
     from improvo.cli.evaluate_options import recorded_sequences
 
     settings = settings_from(PoseCommandSettings, arguments, _FLAGS)
+    output = arguments.output if arguments.export_images is None else None
+    settings = with_found_camera(settings, arguments.sequences, output, COMMAND)
     return settings.pose, recorded_sequences(arguments, settings.sequence)
 
 

@@ -10,6 +10,7 @@ import argparse
 from pathlib import Path
 
 from improvo.cli import output
+from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.flags import add_setting
 from improvo.cli.label import add_job_arguments
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, check_recordings, settings_from
@@ -91,6 +92,8 @@ def run(arguments: argparse.Namespace) -> int:
     check_recordings(arguments.sequences)
     data = read_data_card(arguments.data_card)
     need_torch()
+    recordings = [*arguments.sequences, *arguments.evaluate]
+    settings = with_found_camera(settings, recordings, arguments.output, "improve")
 
     from improvo.depth.compile import compile_depth
     from improvo.improvement.improve import improve

@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.flags import add_setting
 from improvo.cli.options import (
     add_config_arguments,
@@ -70,6 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Label what is not labelled yet; 0 unless nothing could be."""
     settings = settings_from(LabelRunSettings, arguments)
     check_recordings(arguments.sequences)
+    settings = with_found_camera(settings, arguments.sequences, arguments.output, "label")
     from improvo.labeling.label_sequences import label_sequences
     from improvo.labeling.store import DONE
     from improvo.odometry.compile import compile_odometry

@@ -35,11 +35,15 @@ _SEQUENCE_OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 
-def add_sequence_arguments(parser: argparse.ArgumentParser, defaults: SequenceSettings | None = None) -> None:
-    """How the sequence is read; read back by `settings_from`."""
+def add_sequence_arguments(
+    parser: argparse.ArgumentParser, defaults: SequenceSettings | None = None, without: tuple[str, ...] = ()
+) -> None:
+    """How the sequence is read, all but the options `without`; read back by `settings_from`."""
     group = parser.add_argument_group("how the sequence is read")
     defaults = defaults or SequenceSettings()
     for name, options in _SEQUENCE_OPTIONS.items():
+        if name in without:
+            continue
         add_setting(group, defaults, f"--{name.replace('_', '-')}", name, section="sequence.", **options)
 
 

@@ -10,6 +10,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.flags import add_setting
 from improvo.cli.options import (
     add_config_arguments,
@@ -74,6 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     from improvo.sequences import open_sequence
 
     check_output_folder(arguments.output, "run")
+    settings = with_found_camera(settings, [arguments.sequence], arguments.output, "run")
     sequence = open_sequence(arguments.sequence, settings.sequence)
     if settings.dense:
         from improvo.depth.dense import refuse_live
@@ -145,6 +147,7 @@ def _track(sequence: Sequence, folder: Path, settings: DenseRunSettings, viewer:
     """The run with its progress."""
     from improvo.labeling.labeler import run_and_label
     from improvo.odometry.compile import compile_odometry
+    from improvo.self_calibration.found_cameras import with_camera_note
     from improvo.terminal import progress
 
     compile_odometry(notice)
@@ -154,7 +157,8 @@ def _track(sequence: Sequence, folder: Path, settings: DenseRunSettings, viewer:
             shown.note("no pose yet" if frame.cam_from_world is None else "")
             shown.advance()
 
-        return run_and_label(sequence, folder, settings, visualizer=viewer, progress=told)
+        run = run_and_label(sequence, folder, settings, visualizer=viewer, progress=told)
+    return with_camera_note(run, settings.sequence.camera)
 
 
 def _add_depth(sequence: Sequence, summary: LabeledRun, settings: DenseRunSettings) -> bool:
