@@ -16,6 +16,7 @@ FLOORS = (
         "continuation",
         "terminal",
         "errors",
+        "formats",
         "compiled",
         "untrusted",
         "geometry",

@@ -77,7 +77,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         choices=ESTIMATORS,
         default=absent,
-        help="opencv: default solvePnPRansac, the paper's; poselib: a robust one (default: both)",
+        help="opencv: default solvePnPRansac, the paper's; poselib: a robust one; usac: "
+        f"OpenCV's robust one (default: {' '.join(defaults.estimators)})",
     )
     parser.add_argument(
         "--depth-sampling", choices=SAMPLINGS, default=absent, help=f"(default: {defaults.depth_sampling})"

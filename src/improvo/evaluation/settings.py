@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 
 from improvo.errors import ConfigError
 from improvo.geometry.depth_sampling import SAMPLINGS
+from improvo.geometry.ransac import poselib_installed
 from improvo.odometry.settings import OdometrySettings
 from improvo.sequences.base import SequenceSettings
 
-ESTIMATORS = ("opencv", "poselib")
+ESTIMATORS = ("opencv", "poselib", "usac")
+DEFAULT_ESTIMATORS = ("opencv", "poselib" if poselib_installed() else "usac")
 
 # what frames of `redkitchen` (30 Hz) show of each other 30, 60 and 90 frames apart, in the median
 USUAL_OVERLAPS = (0.8, 0.6, 0.45)
@@ -27,7 +29,7 @@ class PoseSettings:
     overlaps: tuple[float, ...] = ()  # in place of `gaps`: shares of A that B shows too, the largest first
     pairs: int = 50  # random pairs per sequence and gap
     max_keypoints: int = 500
-    estimators: tuple[str, ...] = ESTIMATORS  # opencv is the paper's solver, poselib a robust one
+    estimators: tuple[str, ...] = DEFAULT_ESTIMATORS  # opencv is the paper's; poselib, usac (OpenCV's) are robust
     seed: int = 0  # of the pairs, the robust solver and the intervals
     max_rotation_deg: float = 5.0  # success is strictly below
     max_translation_m: float = 0.05  # success is strictly below
@@ -58,6 +60,8 @@ class PoseSettings:
         unknown = set(self.estimators) - set(ESTIMATORS)
         if unknown or not self.estimators:
             raise ConfigError(f"estimators {list(self.estimators)}: choose among {', '.join(ESTIMATORS)}")
+        if "poselib" in self.estimators and not poselib_installed():
+            raise ConfigError("estimators: PoseLib is not installed here; choose usac, or pip install poselib")
         if self.depth_sampling not in SAMPLINGS:
             raise ConfigError(f"depth_sampling `{self.depth_sampling}` is unknown; choose among {', '.join(SAMPLINGS)}")
         limits = (self.max_rotation_deg, self.max_translation_m, self.max_error_px, self.depth_edge)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from improvo.export.onnx import Graph
+    from improvo.frontend.onnx_graph import OnnxGraph
 
 SHAPES: dict[str, tuple[int | str, ...]] = {  # in the order in which OpenCV asks for them
     "keypoints": ("count", 2),
@@ -24,12 +24,12 @@ SHAPES: dict[str, tuple[int | str, ...]] = {  # in the order in which OpenCV ask
 _GREY_OF_RGB = np.array([0.299, 0.587, 0.114], np.float32)  # as cv2.cvtColor
 
 
-def grey(graph: Graph) -> str:
+def grey(graph: OnnxGraph) -> str:
     """The grey image (1, 1, height, width) of the input `image` (1, 3, height, width)."""
     return str(graph.node("Conv", "image", graph.constant(_GREY_OF_RGB.reshape(1, 3, 1, 1))))
 
 
-def outputs(graph: Graph, found: Mapping[str, str]) -> dict[str, str]:
+def outputs(graph: OnnxGraph, found: Mapping[str, str]) -> dict[str, str]:
     """The three outputs from ours, of one image, without the rows past the last keypoint."""
     first = graph.constant([0])
     valid = graph.node("NonZero", graph.node("Squeeze", found["valid"], first))

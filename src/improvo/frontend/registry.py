@@ -36,6 +36,7 @@ def load_frontend(
     Raises:
         ConfigError: an unknown name, network options for a classical frontend, or `least_stability` for a frontend
             without a stability head.
+        MissingExtraError: `surf` without the package mahotas.
         InputError: a weights file that cannot be read.
     """
     check_frontend(name, network)

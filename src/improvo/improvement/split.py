@@ -106,19 +106,28 @@ def split_whole_sequences(records: Sequence[SequenceRecord], sequence: SequenceS
 def remembered_split(path: Path, choose: Callable[[], Split]) -> Split:
     """The split that `path` remembers from an earlier run, else the one that `choose` makes."""
     if path.is_file():
-        mend = "remove the folder and begin again"
-        try:
-            split = config.from_dict(Split, read_json_file(path, mend), where=str(path))
-        except ConfigError as error:
-            raise InputError(f"{error}: is damaged; {mend}") from None
-        if not split.training.paths or not split.held_back.paths:
-            raise InputError(f"{path}: is damaged; {mend}")
-        return split
+        return read_split(path)
     split = choose()
     values = config.to_dict(split)
     for part in ("training", "held_back"):
         values[part]["paths"] = [str(name) for name in values[part]["paths"]]
     write_json(path, values)
+    return split
+
+
+def read_split(path: Path) -> Split:
+    """The split of an earlier run.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    mend = "remove the folder and begin again"
+    try:
+        split = config.from_dict(Split, read_json_file(path, mend), where=str(path))
+    except ConfigError as error:
+        raise InputError(f"{error}: is damaged; {mend}") from None
+    if not split.training.paths or not split.held_back.paths:
+        raise InputError(f"{path}: is damaged; {mend}")
     return split
 
 

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from improvo import config
 from improvo.errors import InputError
+from improvo.files import check_folder_format
+from improvo.formats import FORMAT_KEY, check_format
 from improvo.geometry.camera import Camera
 from improvo.geometry.trajectory_files import read_trajectory
 from improvo.odometry.map_file import read_map
@@ -62,8 +64,10 @@ class RunFolder:
         if not path.is_dir():
             raise InputError(f"{path}: no such folder; give the output folder of `improvo run`")
         try:
+            check_folder_format(path)
             report = _with_present_names(read_json_file(path / "run.json", "run `improvo run` again"))
             self.report: dict[str, Any] = _told_where(report, f"{path / 'run.json'}")
+            check_format(self.report.get(FORMAT_KEY), path / "run.json", "run `improvo run` again")
             self._recorded_input = check_path(Path(self.report["input"]["path"]))
             self.source_index: list[int] = self.report["frames"]["source_index"]
             _check(self.report)

@@ -58,6 +58,38 @@ class PictureStore:
         upper, lower = torch.lerp(grey[0], grey[1], right), torch.lerp(grey[2], grey[3], right)
         return torch.lerp(upper, lower, down)[:, None]
 
+    def grey(self, rows: Int64, points: Tensor, level: int) -> Tensor:
+        """(P, ...) bilinear grey levels at pixels (P, ..., 2) of a level of the pictures; those of the edge outside.
+
+        Args:
+            rows: (P,) numbers of pictures.
+            level: 0 the pictures, 1 the halved ones.
+        """
+        rows = rows + level * self.count
+        shape = (-1, *(1,) * (points.ndim - 2))
+        start = on_device(self.starts[rows], points.device).view(shape)
+        size = on_device(self.sizes[rows], points.device)
+        (x0, x1, right), (y0, y1, down) = (
+            _neighbours(torch.minimum(points[..., axis].clamp(min=0), last), last.long() + 1)
+            for axis, last in enumerate((size - 1.0).T.reshape(2, *shape))
+        )
+        width = size[:, 0].view(shape)
+        above, below = start + y0 * width, start + y1 * width
+        corners = [self.pixels[place].float() for place in (above + x0, above + x1, below + x0, below + x1)]
+        return torch.lerp(torch.lerp(corners[0], corners[1], right), torch.lerp(corners[2], corners[3], right), down)
+
+    def on_level(self, rows: Int64, points: Tensor, level: int) -> Tensor:
+        """Pixels (P, N, 2) of the pictures as pixels of a level."""
+        return (points + 0.5) * self._ratio(rows, level, points) - 0.5
+
+    def off_level(self, rows: Int64, points: Tensor, level: int) -> Tensor:
+        """Pixels (P, N, 2) of a level as pixels of the pictures."""
+        return (points + 0.5) / self._ratio(rows, level, points) - 0.5
+
+    def _ratio(self, rows: Int64, level: int, points: Tensor) -> Tensor:
+        """(P, 1, 2) pixels of a level per pixel of the picture."""
+        return on_device(self.sizes[rows + level * self.count] / self.sizes[rows], points.device)[:, None]
+
     def _suited_level(self, rows: Int64, picture_from_view: Float64, width: int, height: int) -> tuple[Int64, Float64]:
         """Rows of halved pictures where the view looks from afar, and their homographies."""
         middle = np.array([(width - 1) / 2, (height - 1) / 2, 1.0])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from improvo.training.settings import DevicePairSettings
+from improvo.training.held_settings import DevicePairSettings
 from improvo.types import Float32, Float64, Int64, UInt8
 
 _GRID = (16, 12)  # points along x and y on which overlap is measured
