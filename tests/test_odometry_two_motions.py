@@ -8,7 +8,8 @@ from simulated_features import CAMERA
 
 from improvo.geometry import se3
 from improvo.geometry.a_contrario import disc_probability, line_probability, log10_false_alarms
-from improvo.geometry.two_view import Ransac, half_line_distances, relative_pose, sampson_errors
+from improvo.geometry.epipolar import half_line_distances, sampson_errors
+from improvo.geometry.ransac import Ransac, relative_pose
 from improvo.odometry.two_motions import has_second_motion, holds_beside
 from improvo.types import Float64
 

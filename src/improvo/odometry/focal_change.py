@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from improvo.geometry.camera import Camera
-from improvo.geometry.two_view import Ransac, absolute_pose
+from improvo.geometry.ransac import Ransac, absolute_pose
 from improvo.odometry.view import View, common_tracks
 from improvo.types import Float64
 

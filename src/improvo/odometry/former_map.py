@@ -10,7 +10,7 @@ import numpy as np
 from improvo.geometry import se3
 from improvo.geometry.alignment import Similarity
 from improvo.geometry.camera import Camera
-from improvo.geometry.two_view import Ransac, absolute_pose
+from improvo.geometry.ransac import Ransac, absolute_pose
 from improvo.odometry.significance import log10_false_alarms
 from improvo.odometry.view import View
 from improvo.tracking.matching import match_units

@@ -11,7 +11,8 @@ import numpy as np
 
 from improvo.geometry.a_contrario import line_probability, log10_false_alarms
 from improvo.geometry.camera import Camera
-from improvo.geometry.two_view import Ransac, relative_pose, sampson_errors
+from improvo.geometry.epipolar import sampson_errors
+from improvo.geometry.ransac import Ransac, relative_pose
 from improvo.types import Float64, Int64
 
 _FAR = 3.0  # times the tolerance: a match so far off the first motion is none of its own noise
