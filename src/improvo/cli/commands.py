@@ -205,4 +205,5 @@ COMMANDS: dict[str, Command] = {
     ),
     "demo": Command("the main job on a small bundled recording, in minutes", "demo"),
     "config": Command("print all settings of a command as YAML", "config"),
+    "completion": Command("a completion script for bash, zsh or fish", "completion"),
 }

@@ -18,6 +18,7 @@ from improvo.cli.output import figures, next_step, notice, say
 from improvo.cli.train_options import add_data_card, read_data_card
 from improvo.errors import ConfigError
 from improvo.files import check_output_folder
+from improvo.frontend.registry import check_frontend
 from improvo.improvement.settings import RECIPES, ImproveSettings
 from improvo.verbs import need_torch
 
@@ -88,6 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.rounds < 1:
         raise ConfigError(f"--rounds {arguments.rounds}: must be at least 1")
     settings = settings_from(ImproveSettings, arguments, extra=_of_both_recipes(arguments))
+    check_frontend(settings.frontend.name)
     check_output_folder(arguments.output, "improve")
     check_recordings(arguments.sequences)
     data = read_data_card(arguments.data_card)

@@ -75,10 +75,13 @@ def run_matches(arguments: argparse.Namespace) -> None:
     import numpy as np
 
     from improvo.files import write_png
-    from improvo.frontend.registry import load_frontend
+    from improvo.frontend.registry import check_frontend, load_frontend
     from improvo.report.match_picture import paint_matches
     from improvo.report.palettes import palette
 
+    names = arguments.frontends.split(",")
+    for name in names:
+        check_frontend(name)
     sequence, _ = _opened_sequence(arguments)
     pair = chosen_frames(arguments.pair, len(sequence))
     if len(pair) != 2 or "," not in arguments.pair:
@@ -95,7 +98,7 @@ def run_matches(arguments: argparse.Namespace) -> None:
             palette(arguments.palette),
             masks=(frame_a.mask, frame_b.mask),
         )
-        for name in arguments.frontends.split(",")
+        for name in names
     ]
     target = target_path(arguments.output, Path(), "matches.png")
     write_png(target, np.concatenate(rows))
