@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import json
 import os
 import subprocess
 import sys
@@ -51,7 +50,10 @@ def holder(tmp_path: Path) -> subprocess.Popen[str]:
 
 
 def test_a_second_process_is_told_who_is_at_work(tmp_path: Path, holder: subprocess.Popen[str]) -> None:
-    with pytest.raises(OutputError, match=rf"process {holder.pid} on .* \(since 2.* is at work there"), locked(tmp_path):
+    with (
+        pytest.raises(OutputError, match=rf"process {holder.pid} on .* \(since 2.* is at work there"),
+        locked(tmp_path),
+    ):
         pass
 
 

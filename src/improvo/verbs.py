@@ -49,6 +49,7 @@ def run(
     """
     from improvo.depth.dense import refuse_live, write_dense
     from improvo.depth.run_settings import DenseRunSettings
+    from improvo.folder_lock import working_in
     from improvo.labeling.labeler import run_and_label
     from improvo.odometry.run_settings import RunSettings
     from improvo.odometry.scale.apply import apply_scale
@@ -64,11 +65,12 @@ def run(
         refuse_live(sequence)
     scale = settings.scale if isinstance(settings, DenseRunSettings) else ScaleSettings()
     ask = scale_source(sequence, scale)  # before any work
-    result = run_and_label(sequence, Path(output), settings, frontend=frontend)
-    if ask is not None:
-        result = apply_scale(sequence, result, ask, scale)
-    if depth is not None:
-        write_dense(sequence, result, depth)
+    with working_in(Path(output), "run"):
+        result = run_and_label(sequence, Path(output), settings, frontend=frontend)
+        if ask is not None:
+            result = apply_scale(sequence, result, ask, scale)
+        if depth is not None:
+            write_dense(sequence, result, depth)
     return result
 
 

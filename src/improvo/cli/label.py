@@ -96,6 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
             ray=arguments.ray,
             on_record=on_record,
             on_frames=shown.advance,
+            on_wait=lambda name, holder: say(f"{name}: {holder} labels it; its result is waited for"),
         )
     done = [record for record in records if record.state == DONE]
     stable, unstable = sum(r.stable for r in done), sum(r.unstable for r in done)

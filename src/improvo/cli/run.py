@@ -70,6 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     extra += scale_settings(arguments.scale) if arguments.scale else []
     settings = settings_from(DenseRunSettings, arguments, extra=extra)
     from improvo.files import check_output_folder
+    from improvo.folder_lock import working_in
     from improvo.sequences import open_sequence
 
     check_output_folder(arguments.output, "run")
@@ -88,6 +89,12 @@ def run(arguments: argparse.Namespace) -> int:
     for note in sequence.notes:
         say(f"note: {note}")
     ask = _scale_source(sequence, settings)
+    with working_in(arguments.output, "run"):
+        return _tracked(arguments, sequence, settings, ask)
+
+
+def _tracked(arguments: argparse.Namespace, sequence: Sequence, settings: DenseRunSettings, ask: Ask | None) -> int:
+    """Everything that is written; 130 after an interrupt."""
     summary = _track(sequence, arguments.output, settings, _viewer(arguments))
     if ask is not None:
         summary = _in_metres(sequence, summary, ask, settings)
