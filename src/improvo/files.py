@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from improvo import locations
 from improvo.errors import InputError, OutputError
 from improvo.untrusted.paths import check_path
 from improvo.untrusted.text import load_json
@@ -48,6 +49,8 @@ def written_atomically(path: Path) -> Iterator[Path]:
         _open_here.add(temporary.name)
         yield temporary
         os.replace(temporary, path)
+        made = False
+        locations.written(path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error}); choose another folder") from None
     finally:

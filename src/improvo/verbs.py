@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from improvo.locations import local_folder, publish
+
 if TYPE_CHECKING:
     from improvo.evaluation.settings import PoseSettings, TrajectorySettings
     from improvo.evaluation.trajectory.protocol import TrajectoryErrors
@@ -65,12 +67,14 @@ def run(
         refuse_live(sequence)
     scale = settings.scale if isinstance(settings, DenseRunSettings) else ScaleSettings()
     ask = scale_source(sequence, scale)  # before any work
-    with working_in(Path(output), "run"):
-        result = run_and_label(sequence, Path(output), settings, frontend=frontend)
+    folder = local_folder(output)
+    with working_in(folder, "run"):
+        result = run_and_label(sequence, folder, settings, frontend=frontend)
         if ask is not None:
             result = apply_scale(sequence, result, ask, scale)
         if depth is not None:
             write_dense(sequence, result, depth)
+    publish(folder)
     return result
 
 
@@ -101,7 +105,10 @@ def label(
     from improvo.odometry.run_settings import LabelRunSettings
 
     chosen = settings or LabelRunSettings()
-    return label_sequences([Path(path) for path in sequences], Path(output), chosen, workers, ray=ray)
+    folder = local_folder(output)
+    records = label_sequences([Path(path) for path in sequences], folder, chosen, workers, ray=ray)
+    publish(folder)
+    return records
 
 
 @dataclass(frozen=True)
@@ -140,10 +147,17 @@ def train_odometry(
     need_torch()
     from improvo.training import stages
 
-    settings, folder = settings or OdometryTrainingSettings(), Path(output)
+    settings, folder = settings or OdometryTrainingSettings(), local_folder(output)
     metrics = stages.train_odometry(
-        [Path(path) for path in labels], settings, folder, find_weights(start), tuple(data), False, list(pictures)
+        [local_folder(path, writing=False) for path in labels],
+        settings,
+        folder,
+        find_weights(start),
+        tuple(data),
+        False,
+        list(pictures),
     )
+    publish(folder)
     return Trained(folder / "weights.safetensors", metrics)
 
 
@@ -189,7 +203,10 @@ def improve(
     from improvo.improvement.settings import ImproveSettings
 
     recordings, held_out = [Path(path) for path in sequences], [Path(path) for path in evaluate]
-    return run_rounds(recordings, Path(output), settings or ImproveSettings(), rounds, held_out, workers)
+    folder = local_folder(output)
+    result = run_rounds(recordings, folder, settings or ImproveSettings(), rounds, held_out, workers)
+    publish(folder)
+    return result
 
 
 @dataclass(frozen=True)

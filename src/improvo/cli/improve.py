@@ -12,7 +12,13 @@ from pathlib import Path
 from improvo.cli import output
 from improvo.cli.flags import add_setting
 from improvo.cli.label import add_job_arguments
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, check_recordings, settings_from
+from improvo.cli.options import (
+    add_config_arguments,
+    add_sequence_arguments,
+    check_recordings,
+    folder_path,
+    settings_from,
+)
 from improvo.cli.output import figures, next_step, notice, say
 from improvo.cli.plan import say_improve_plan
 from improvo.cli.train_options import add_data_card, read_data_card
@@ -28,7 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "sequences", type=Path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
     )
-    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="folder; an unfinished one is continued")
+    parser.add_argument(
+        "-o", "--output", type=folder_path, metavar="OUT", help="folder; an unfinished one is continued"
+    )
     parser.add_argument(
         "--plan", action="store_true", help="label a short sample only, and say what all of it will cost"
     )

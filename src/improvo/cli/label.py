@@ -17,6 +17,7 @@ from improvo.cli.options import (
     add_frontend_arguments,
     add_sequence_arguments,
     check_recordings,
+    folder_path,
     settings_from,
 )
 from improvo.cli.output import figures, next_step, notice, say
@@ -34,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "sequences", type=Path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
     )
-    parser.add_argument("-o", "--output", type=Path, metavar="LABELS", help="folder of the label store")
+    parser.add_argument("-o", "--output", type=folder_path, metavar="LABELS", help="folder of the label store")
     parser.add_argument(
         "--plan", action="store_true", help="label a short sample only, and say what all of it will cost"
     )

@@ -15,6 +15,7 @@ from improvo.cli.options import (
     add_config_arguments,
     add_frontend_arguments,
     add_sequence_arguments,
+    folder_path,
     recording_path,
     settings_from,
 )
@@ -39,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "sequence", type=recording_path, metavar="SEQUENCE", help="a video, an image folder, a data set, or `demo`"
     )
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
+    parser.add_argument("-o", "--output", type=folder_path, required=True, metavar="OUT", help="folder for the results")
     add_frontend_arguments(parser, defaults)
     add_setting(parser, defaults, "--mode", "odometry.mode", choices=("robust", "paper"))
     parser.add_argument(

@@ -36,6 +36,7 @@ from improvo.files import (
     written_atomically,
 )
 from improvo.folder_lock import LOCK, BusyError, holder_of, locked, seems_held
+from improvo.locations import publish, removed
 from improvo.untrusted.text import read_json_file
 
 MANIFEST_FILE, SETTINGS_FILE, RECORD_FILE = "manifest.parquet", "settings.yaml", "label.json"
@@ -128,8 +129,10 @@ class LabelStore:
         for record in self.records():
             if record.state == DONE:
                 (self.folder / record.name).rename(self.partial(record.name))
+                removed(self.folder / record.name)
             else:
                 _failure_of(self.folder, record.name).unlink(missing_ok=True)
+                removed(_failure_of(self.folder, record.name))
 
     def records(self) -> list[SequenceRecord]:
         """All sequences that are done or have failed, by name."""
@@ -201,7 +204,11 @@ def finish_sequence(folder: Path, record: SequenceRecord) -> None:
         partial.rename(final)
     except OSError as error:
         raise OutputError(f"{final}: cannot be put in place ({error.strerror}); remove what is there") from None
-    _failure_of(folder, record.name).unlink(missing_ok=True)
+    failure = _failure_of(folder, record.name)
+    if failure.is_file():
+        failure.unlink()
+        removed(failure)
+    publish(final)
 
 
 def _failure_of(folder: Path, name: str) -> Path:
