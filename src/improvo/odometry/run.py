@@ -33,6 +33,7 @@ from improvo.odometry.run_settings import RunSettings
 from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
 from improvo.odometry.visualizer import NullVisualizer, Visualizer
 from improvo.sequences import Sequence
+from improvo.terminal import counted
 from improvo.types import Trajectory
 
 _MIN_FRAMES = 3
@@ -90,7 +91,9 @@ def run_odometry(
     frontend = frontend or frontend_from(settings.frontend)
     visualizer = visualizer or NullVisualizer()
     if sequence.length is not None and sequence.length < _MIN_FRAMES:
-        raise InputError(f"{sequence.path}: has {sequence.length} frames; odometry needs at least {_MIN_FRAMES}")
+        raise InputError(
+            f"{sequence.path}: has {counted(sequence.length, 'frame')}; odometry needs at least {_MIN_FRAMES}"
+        )
     make_output_folder(folder, command)
     seconds: defaultdict[str, float] = defaultdict(float)
     started = time.perf_counter()
