@@ -129,7 +129,7 @@ def test_odometry_with_a_logo_is_right_and_says_so() -> None:
 
 def test_tracks_of_a_logo_are_no_overlap_for_a_start() -> None:
     """The camera turns away from what it saw at first, and only the logo is still there."""
-    views = [view for view, _ in marked(with_logos(seen(hand_motion(16, step=0.08, turn_deg=-3.0))))]
+    views = [view for view, _ in marked(with_logos(seen(hand_motion(14, step=0.06, turn_deg=4.0))))]
     for view in views:
         view.attached = np.arange(len(view)) < 120
     started = start_map(views, CAMERA, OdometrySettings(), 0.7)
