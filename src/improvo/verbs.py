@@ -166,6 +166,7 @@ def improve(
     rounds: int = 1,
     evaluate: Sequence[PathLike] = (),
     workers: int = 1,
+    after: PathLike | None = None,
 ) -> Improvement:
     """The loop: label, train, validate, and keep the better weights, as `improvo improve` does it.
 
@@ -176,6 +177,7 @@ def improve(
         rounds: of labelling, training and validation.
         evaluate: recordings to hold out; without any, some of `sequences`, or the last part of a single one.
         workers: sequences labelled at a time.
+        after: finished folder of an earlier call, whose recordings are replayed and must not get worse.
 
     Raises:
         MissingExtraError: torch is not installed.
@@ -187,7 +189,8 @@ def improve(
     from improvo.improvement.settings import ImproveSettings
 
     recordings, held_out = [Path(path) for path in sequences], [Path(path) for path in evaluate]
-    return run_rounds(recordings, Path(output), settings or ImproveSettings(), rounds, held_out, workers)
+    chosen, before = settings or ImproveSettings(), Path(after) if after is not None else None
+    return run_rounds(recordings, Path(output), chosen, rounds, held_out, workers, after=before)
 
 
 @dataclass(frozen=True)
