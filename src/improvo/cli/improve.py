@@ -10,6 +10,7 @@ import argparse
 from pathlib import Path
 
 from improvo.cli import output
+from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.flags import add_setting
 from improvo.cli.label import add_job_arguments
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, check_recordings, settings_from
@@ -17,6 +18,7 @@ from improvo.cli.output import figures, next_step, notice, say
 from improvo.cli.train_options import add_data_card, read_data_card
 from improvo.errors import ConfigError
 from improvo.files import check_output_folder
+from improvo.frontend.registry import check_frontend
 from improvo.improvement.settings import RECIPES, ImproveSettings
 from improvo.verbs import need_torch
 
@@ -94,10 +96,13 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.rounds < 1:
         raise ConfigError(f"--rounds {arguments.rounds}: must be at least 1")
     settings = settings_from(ImproveSettings, arguments, extra=_of_both_recipes(arguments))
+    check_frontend(settings.frontend.name)
     check_output_folder(arguments.output, "improve")
     check_recordings(arguments.sequences)
     data = read_data_card(arguments.data_card)
     need_torch()
+    recordings = [*arguments.sequences, *arguments.evaluate]
+    settings = with_found_camera(settings, recordings, arguments.output, "improve")
 
     from improvo.depth.compile import compile_depth
     from improvo.improvement.improve import improve

@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.flags import add_setting
 from improvo.cli.options import (
     add_config_arguments,
@@ -20,6 +21,7 @@ from improvo.cli.options import (
 )
 from improvo.cli.output import figures, next_step, notice, say
 from improvo.odometry.run_settings import LabelRunSettings
+from improvo.terminal import counted
 
 if TYPE_CHECKING:
     from improvo.labeling.store import SequenceRecord
@@ -70,11 +72,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Label what is not labelled yet; 0 unless nothing could be."""
     settings = settings_from(LabelRunSettings, arguments)
     check_recordings(arguments.sequences)
+    from improvo.frontend.registry import check_frontend
     from improvo.labeling.label_sequences import label_sequences
     from improvo.labeling.store import DONE
     from improvo.odometry.compile import compile_odometry
     from improvo.terminal import progress
 
+    check_frontend(settings.frontend.name, settings.frontend.network)
+    settings = with_found_camera(settings, arguments.sequences, arguments.output, "label")
     compile_odometry(notice)
     total = len(arguments.sequences)
     finished = 0
@@ -114,7 +119,7 @@ def _line(record: SequenceRecord) -> str:
 
     if record.state != DONE:
         return f"{record.name}: not labelled: {record.reason}"
-    poses = f"{record.tracked} of {record.frames} frames with a pose"
+    poses = f"{record.tracked} of {counted(record.frames, 'frame')} with a pose"
     labels = f"{record.stable} stable, {record.unstable} unstable, {record.ignore} ignored tracks"
     withheld = f", {record.withheld} withheld" if record.withheld else ""
     return f"{record.name}: {poses}; {labels}{withheld}" + (f"; frames: {record.notes}" if record.notes else "")

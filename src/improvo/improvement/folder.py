@@ -159,7 +159,7 @@ class ImproveFolder:
 
     def _begin(self, values: dict[str, Any]) -> None:
         free = [f"{section}.optimiser.{name}" for section in ("training", "held") for name in _FREE]
-        free.append("control")  # it may be added later
+        free += ["training.memory_mib", "control"]  # a control may be added later
         record = SettingsRecord(self.folder / "settings.yaml", ImproveSettings, free)
         if self.split.is_file():
             self._refuse_former(record)

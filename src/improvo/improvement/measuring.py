@@ -148,8 +148,8 @@ def _truth(
         if not usable:
             continue
         protocol = PoseSettings(
-            usable, matches.pairs, matches.max_keypoints, seed=matches.seed, shuffles=matches.shuffles,
-            right_px=matches.right_px,
+            gaps=usable, pairs=matches.pairs, max_keypoints=matches.max_keypoints, seed=matches.seed,
+            shuffles=matches.shuffles, right_px=matches.right_px,
         )  # fmt: skip
         run = run_pose_protocol(
             [Recorded(str(path), part.sequence)], [frontend], protocol, candidate.folder / "features" / str(number),

@@ -10,7 +10,7 @@ from improvo.improvement.settings import ValidationSettings
 from improvo.improvement.split import Split
 from improvo.improvement.validation import Validation, gain, loose
 from improvo.labeling.store import DONE, SequenceRecord
-from improvo.terminal import progress
+from improvo.terminal import counted, progress
 
 Tick = Callable[..., None]  # told that so many more are done; one if it is not told how many
 
@@ -52,7 +52,7 @@ class ImprovementProgress:
             self.line(f"{what}, {record.name}: not labelled: {record.reason}")
             return
         self.line(
-            f"{what}, {record.name}: {record.tracked} of {record.frames} frames with a pose; "
+            f"{what}, {record.name}: {record.tracked} of {counted(record.frames, 'frame')} with a pose; "
             f"{record.stable} stable, {record.unstable} unstable tracks"
         )
 

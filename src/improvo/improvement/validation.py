@@ -12,6 +12,7 @@ from improvo import config
 from improvo.errors import ConfigError, InputError
 from improvo.evaluation.pose.self_truth import PairScores, SelfTruthSettings, compare_gaps
 from improvo.files import write_json
+from improvo.formats import FORMAT, FORMAT_KEY, check_format
 from improvo.improvement.settings import ValidationSettings
 from improvo.untrusted.text import read_json_file
 
@@ -185,7 +186,10 @@ def summary(validation: Validation, start: Validation, settings: ValidationSetti
 
 def write_validation(path: Path, validation: Validation) -> None:
     """Keep it for later runs, as JSON (which has no NaN)."""
-    write_json(path, {**asdict(validation), "error": None if np.isnan(validation.error) else validation.error})
+    write_json(
+        path,
+        {FORMAT_KEY: FORMAT, **asdict(validation), "error": None if np.isnan(validation.error) else validation.error},
+    )
 
 
 def read_validation(path: Path) -> Validation:
@@ -196,6 +200,7 @@ def read_validation(path: Path) -> Validation:
     """
     mend = "remove it, and it is measured again"
     values = read_json_file(path, mend)
+    check_format(values.pop(FORMAT_KEY, None), path, mend)
     error = values.get("error", 0.0)
     try:
         found = config.from_dict(Validation, {**values, "error": float("nan") if error is None else error})

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from improvo.errors import InputError
 from improvo.files import written_atomically
 from improvo.sequences.base import UnreadableFrameError
-from improvo.stability.tables import read_table
+from improvo.stability.table_reading import read_table
 from improvo.types import Float64, Int64, Mask, UInt8
 from improvo.untrusted.text import reason
 

@@ -115,7 +115,7 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
         raise KeyboardInterrupt
     if labeled.tracked == 0:
         raise InputError(f"{job.path}: no frame got a pose: {_last_reason(report)}")
-    counts = labeled.points.counts()
+    counts = report["tracks"]
     if counts["stable"] + counts["unstable"] == 0:
         raise InputError(f"{job.path}: no track has a label ({_why_none(quality.counts(), counts)})")
     frames = FramesTable(
@@ -141,7 +141,7 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
         tracked=labeled.tracked,
         trusted=int(quality.trusted.sum()),
         segments=len(report["segments"]),
-        tracks=len(labeled.points),
+        tracks=counts["tracks"],
         stable=counts["stable"],
         unstable=counts["unstable"],
         ignore=counts["ignore"],
@@ -202,7 +202,12 @@ def _notes(report: dict[str, Any], quality: dict[str, int]) -> str:
     if len(report["segments"]) > 1:
         starts = ", ".join(str(segment["first"]) for segment in report["segments"][1:])
         notes.append(f"tracking began anew at frame {starts}")
-    reasons = {"high_error": "that fit badly", "little_parallax": "of little parallax", "contradicted": "in doubt"}
+    reasons = {
+        "high_error": "that fit badly",
+        "little_parallax": "of little parallax",
+        "contradicted": "in doubt",
+        "doubtful": "of a doubtful path",
+    }
     notes += [f"{quality[name]} {words}" for name, words in reasons.items() if quality[name]]
     return "; ".join(notes)
 

@@ -8,6 +8,7 @@
             frames.parquet      frame, index in the recording, time, segment, trusted
             images-00000.parquet ...   with --pack: the frames themselves
             label.json          this sequence's row of the manifest
+            landmarks-*.safetensors   made by training from the tables, see `improvo.training.landmark_files`
 
 A sequence in work lives in `.NAME.partial`; what a killed run leaves there is cleared away by the next one. The
 manifest is made from the folders, so it can be lost without harm.
@@ -24,7 +25,7 @@ from typing import Any
 
 from improvo.continuation import SettingsRecord
 from improvo.errors import InputError, OutputError
-from improvo.files import check_output_folder, make_output_folder, write_json, written_atomically
+from improvo.files import check_folder_format, check_output_folder, make_output_folder, write_json, written_atomically
 from improvo.untrusted.text import read_json_file
 
 MANIFEST_FILE, SETTINGS_FILE, RECORD_FILE = "manifest.parquet", "settings.yaml", "label.json"
@@ -154,6 +155,7 @@ def read_records(folder: Path) -> list[SequenceRecord]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; `improvo label` makes it")
+    check_folder_format(folder)
     files = [*folder.glob(f"*/{RECORD_FILE}"), *folder.glob(".*.failed.json")]
     records: dict[str, SequenceRecord] = {}
     for file in files:

@@ -58,7 +58,7 @@ def train_held(
         pictures, posed, settings, network_teacher(parent, "detector", device, precision),
         network_teacher(stability, "stability", device, precision) if stability else None, device,
     )  # fmt: skip
-    batches = _with_tracks(dense, labels)
+    batches = _with_tracks(dense, labels, output)
     if not data:
         names = (*(source.name for source in pictures.sources), *(sequence.name for sequence in posed))
         data = tuple(DataSource(name, "not stated") for name in names)
@@ -75,17 +75,17 @@ def train_held(
     return run_stage(HeldStage(network, settings), batches, settings, output, card, progress, left)
 
 
-def _with_tracks(dense: DevicePairs, labels: Sequence[Path]) -> Batches:
+def _with_tracks(dense: DevicePairs, labels: Sequence[Path], output: Path) -> Batches:
     from improvo.labeling.labeled import read_labels
-    from improvo.training.labeled_frames import LabeledFrames
+    from improvo.training.label_library import LabelLibrary
     from improvo.training.mixed_pairs import MixedPairs, tracked_settings
     from improvo.training.tracked_pairs import TrackedPairs
 
     settings = tracked_settings(dense.settings)
     sequences = [sequence for folder in labels for sequence in read_labels(folder)]
-    frames = [LabeledFrames(sequence, settings.longer_side, settings.landmarks) for sequence in sequences]
-    useful = [labelled for labelled in frames if len(labelled.useful_frames(settings.pairs.least_points))]
-    return MixedPairs(dense, TrackedPairs(useful, settings)) if useful else dense
+    frames = LabelLibrary(sequences, settings.longer_side, settings.landmarks, output, settings.memory_mib)
+    tracked = TrackedPairs(frames, settings)
+    return MixedPairs(dense, tracked) if tracked.useful_frames else dense
 
 
 def _student(parent: Weights, stability: Weights | None, settings: HeldSettings) -> SuperPoint:

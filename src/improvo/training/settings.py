@@ -240,6 +240,7 @@ class OdometryTrainingSettings:
     """`improvo train odometry`: VO adaptation, from label stores (paper, "Training Details")."""
 
     longer_side: int = 320  # pixels; larger frames are reduced on loading
+    memory_mib: int = 64  # of labelled sequences that are kept open, in each process that prepares batches
     detector_weight: float = 0.3
     descriptor_weight: float = 1.0
     stability_weight: float = 1.0
@@ -261,6 +262,7 @@ class OdometryTrainingSettings:
         checks = Checks(self)
         checks.choice("descriptor_loss", DESCRIPTOR_LOSSES)
         checks.at_least(0, "detector_weight", "descriptor_weight", "stability_weight", "masked_pixels")
+        checks.at_least(1, "memory_mib")
         checks.at_least(2 * CELL, "longer_side")
         good = not self.negatives_across or self.descriptor_loss == INFO_NCE
         checks.that("negatives_across", good, f"needs `descriptor_loss={INFO_NCE}`")

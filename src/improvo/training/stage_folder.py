@@ -149,7 +149,7 @@ def _saved_steps(path: Path) -> int:
 
 def _same_settings(path: Path, settings: StageSettings) -> None:
     """Remember the settings of the folder; refuse to continue it under others."""
-    record = SettingsRecord(path, type(settings), [f"optimiser.{name}" for name in _FREE])
+    record = SettingsRecord(path, type(settings), [*(f"optimiser.{name}" for name in _FREE), "memory_mib"])
     values = config.to_dict(settings)
     record.check(values, "give the same settings or another output folder")
     record.write(values)
