@@ -13,6 +13,7 @@ FLOORS = (
         "config",
         "files",
         "folder_lock",
+        "locations",
         "continuation",
         "terminal",
         "errors",

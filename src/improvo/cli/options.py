@@ -88,6 +88,20 @@ def recording_path(text: str) -> Path:
     return bundled_sequence()
 
 
+def folder_path(text: str) -> Path:
+    """The type of an argument that names a folder to write in, here or at a location such as `s3://bucket/folder`."""
+    from improvo.locations import local_folder
+
+    return local_folder(text)
+
+
+def read_folder_path(text: str) -> Path:
+    """As `folder_path`, of a folder that is only read."""
+    from improvo.locations import local_folder
+
+    return local_folder(text, writing=False)
+
+
 def check_recordings(paths: list[Path]) -> None:
     """Refuse a list of recordings of which none is there; where only some are missing, the rest is worked on.
 

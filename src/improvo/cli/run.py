@@ -16,6 +16,7 @@ from improvo.cli.options import (
     add_config_arguments,
     add_frontend_arguments,
     add_sequence_arguments,
+    folder_path,
     recording_path,
     settings_from,
 )
@@ -43,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "sequence", type=recording_path, metavar="SEQUENCE", help="a video, an image folder, a data set, or `demo`"
     )
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
+    parser.add_argument("-o", "--output", type=folder_path, required=True, metavar="OUT", help="folder for the results")
     add_frontend_arguments(parser, defaults)
     add_setting(parser, defaults, "--mode", "odometry.mode", choices=("robust", "paper"))
     parser.add_argument(
@@ -74,6 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     extra += scale_settings(arguments.scale) if arguments.scale else []
     settings = settings_from(DenseRunSettings, arguments, extra=extra)
     from improvo.files import check_output_folder
+    from improvo.folder_lock import working_in
     from improvo.frontend.registry import check_frontend
     from improvo.sequences import open_sequence
 
@@ -95,6 +97,12 @@ def run(arguments: argparse.Namespace) -> int:
     for note in sequence.notes:
         say(f"note: {note}")
     ask = _scale_source(sequence, settings)
+    with working_in(arguments.output, "run"):
+        return _tracked(arguments, sequence, settings, ask)
+
+
+def _tracked(arguments: argparse.Namespace, sequence: Sequence, settings: DenseRunSettings, ask: Ask | None) -> int:
+    """Everything that is written; 130 after an interrupt."""
     summary = _track(sequence, arguments.output, settings, _viewer(arguments))
     if ask is not None:
         summary = _in_metres(sequence, summary, ask, settings)
