@@ -12,7 +12,13 @@ from pathlib import Path
 from improvo.cli import output
 from improvo.cli.flags import add_setting
 from improvo.cli.label import add_job_arguments
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, check_recordings, settings_from
+from improvo.cli.options import (
+    add_config_arguments,
+    add_sequence_arguments,
+    check_recordings,
+    recording_path,
+    settings_from,
+)
 from improvo.cli.output import figures, next_step, notice, say
 from improvo.cli.train_options import add_data_card, read_data_card
 from improvo.errors import ConfigError
@@ -26,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `improvo improve`."""
     defaults = ImproveSettings()
     parser.add_argument(
-        "sequences", type=Path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
+        "sequences", type=recording_path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
     )
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="OUT", help="folder; an unfinished one is continued"
