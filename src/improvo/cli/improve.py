@@ -18,6 +18,7 @@ from improvo.cli.options import (
     add_sequence_arguments,
     check_recordings,
     folder_path,
+    recording_path,
     settings_from,
 )
 from improvo.cli.output import figures, next_step, notice, say
@@ -34,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `improvo improve`."""
     defaults = ImproveSettings()
     parser.add_argument(
-        "sequences", type=Path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
+        "sequences", type=recording_path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
     )
     parser.add_argument(
         "-o", "--output", type=folder_path, metavar="OUT", help="folder; an unfinished one is continued"
