@@ -38,7 +38,7 @@ def start_map(
     """
     b = buffer[-1]
     least = settings.start.min_common_tracks
-    a = next((view for view in buffer[:-1] if len(common_tracks(view, b)[0]) >= least), None)
+    a = next((view for view in buffer[:-1] if _shared(view, b) >= least), None)
     if a is None:
         return InitFailure("too few tracks")
     pair = initial_pair(a, b, camera, settings, descriptor_distance)
@@ -52,6 +52,12 @@ def start_map(
         return failure
     _normalise([view for view in buffer if view.cam_from_world is not None], local_map)
     return local_map
+
+
+def _shared(a: View, b: View) -> int:
+    """Tracks that two views share; what moves with the camera is no reason to think that they see the same place."""
+    rows_a, rows_b = common_tracks(a, b)
+    return int((~(a.attached[rows_a] | b.attached[rows_b])).sum())
 
 
 def _grow(
