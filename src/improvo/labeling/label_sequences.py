@@ -15,8 +15,8 @@ import numpy as np
 from improvo.config import to_dict
 from improvo.errors import ImprovoError, InputError, OutputError
 from improvo.folder_lock import BusyError, claimed, seems_held
-from improvo.jobs.on_ray import run_on_ray
-from improvo.jobs.processes import Tick, run_here, run_in_processes
+from improvo.jobs.crew import Crew
+from improvo.jobs.processes import Tick
 from improvo.labeling.frames import FRAMES_FILE, FramesTable, pack_images, write_frames
 from improvo.labeling.labeler import run_and_label
 from improvo.labeling.store import (
@@ -116,13 +116,11 @@ def label_sequences(
             records[job.name] = _stored(store, job, result)
             on_record(records[job.name])
 
-        if ray is not None:
-            run_on_ray(label_sequence, jobs, on_result, on_frames, ray, workers)
-        elif len(jobs) == 1 or (workers or 1) <= 1:
-            run_here(label_sequence, jobs, on_result, on_frames)
-        else:
-            run_in_processes(label_sequence, jobs, on_result, on_frames, min(workers or 1, len(jobs)))
+        crew.do(label_sequence, jobs, on_result, on_frames, gpus)
         return elsewhere
+
+    crew = Crew(workers, ray)
+    gpus = int(ray is not None and settings.frontend.network.device == "cuda")
 
     while jobs:
         jobs = run(jobs)
