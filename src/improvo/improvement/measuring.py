@@ -6,7 +6,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -105,10 +105,16 @@ class _ScoreJob:
 
 
 def _scores_of(job: _ScoreJob, tick: Callable[[], None]) -> list[GapScores]:
+    frontend = _loaded(job.weights, job.settings.matches.max_keypoints, job.weights.stat().st_mtime_ns)
+    return _scores(job.reference, frontend, job.settings, tick)
+
+
+@lru_cache(maxsize=1)
+def _loaded(weights: Path, max_keypoints: int, written: int) -> Frontend:
+    """The frontend of the recording before it, too; loading takes a second."""
     from improvo.frontend.registry import load_frontend
 
-    frontend = load_frontend(str(job.weights), job.settings.matches.max_keypoints)
-    return _scores(job.reference, frontend, job.settings, tick)
+    return load_frontend(str(weights), max_keypoints)
 
 
 def _scores(

@@ -29,6 +29,7 @@ from improvo.labeling.store import (
     lock_of,
     sequence_names,
 )
+from improvo.locations import folder_here, refresh, url_of
 from improvo.odometry.run_settings import RunSettings
 
 logger = logging.getLogger(__name__)
@@ -45,6 +46,7 @@ class LabelJob:
     store: Path
     settings: RunSettings
     pack: bool
+    url: str = ""  # of the store, where it is at a location
 
     @property
     def folder(self) -> Path:
@@ -102,7 +104,10 @@ def label_sequences(
         if record.path != str(names[name]):
             raise InputError(f"{names[name]}: the store has another recording named {name}; rename one of them")
         on_record(record)
-    jobs = [LabelJob(name, path, store.folder, settings, pack) for name, path in names.items() if name not in before]
+    url = url_of(store.folder)
+    jobs = [
+        LabelJob(name, path, store.folder, settings, pack, url) for name, path in names.items() if name not in before
+    ]
 
     def run(jobs: Sequence[LabelJob]) -> list[LabelJob]:
         """Do them; returns those that somebody else works on."""
@@ -125,6 +130,7 @@ def label_sequences(
     while jobs:
         jobs = run(jobs)
         _wait_for_one(jobs)
+    refresh(store.folder)
     try:
         store.write_manifest()
     except OutputError as error:  # the labels do not need it, and the next run writes it
@@ -152,6 +158,7 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
         BusyError: another process does it.
         KeyboardInterrupt: it was interrupted; the partial folder is worth nothing.
     """
+    job = replace(job, store=folder_here(job.store, job.url))
     with claimed(job.lock, job.path):
         done = finished_record(job.store, job.name)
         if done is not None:
