@@ -101,6 +101,8 @@ class VerdictSettings:
     # simulated and real recordings with truth (docs/odometry.md).
     scale_share: float = 40.0
     max_error: float = 5.0  # % of the path; a larger estimated error makes a segment doubtful
+    max_focal_change: float = 0.12  # of the logarithm of the focal length, within a window or from one to the next
+    max_focal_error: float = 0.2  # of the logarithm of the focal length, from that of the camera as given
     max_scale_error: float = 0.1  # of the logarithm of the scale between two windows; more is an uncertain stretch
 
     def __post_init__(self) -> None:
