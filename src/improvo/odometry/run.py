@@ -140,7 +140,7 @@ def _track_all(
         for detected in detected_ahead(sequence, partial(features_of, frontend), odometry.match):
             with interrupts_wait():
                 start = time.perf_counter()
-                tracked = odometry.track_matched(detected.matched, detected.frame.time)
+                tracked = odometry.track_matched(detected.matched, detected.frame.time, detected.frame.image)
                 seconds["track and adjust"] += time.perf_counter() - start
                 seconds["read"] += detected.reading
                 seconds["detect"] += detected.detecting
