@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any, TextIO, TypeVar
 
 T = TypeVar("T")
@@ -71,6 +71,28 @@ def each(items: Collection[T], words: str, unit: str, shown: bool = True) -> Ite
         for item in items:
             yield item
             told.advance()
+
+
+@contextmanager
+def stages(unit: str) -> Iterator[Callable[[str, int, int], None]]:
+    """Show the progress of work with several stages, each as a `progress` of its own.
+
+    Yields:
+        What to tell: the stage in words, how many are done, and of how many.
+    """
+    before: dict[str, int] = {}  # stage -> how many were done when it was last heard of
+    bar = Progress()
+    with ExitStack() as shown:
+
+        def told(stage: str, done: int, total: int) -> None:
+            nonlocal bar
+            if stage not in before:
+                shown.close()
+                bar = shown.enter_context(progress(stage, unit, total))
+            bar.advance(done - before.get(stage, 0))
+            before[stage] = done
+
+        yield told
 
 
 class _Bar(Progress):

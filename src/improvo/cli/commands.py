@@ -192,7 +192,12 @@ COMMANDS: dict[str, Command] = {
         "improvo.sequences.settings:InfoSettings",
         figures=True,
     ),
-    "calibrate": Command("a camera from a recording of a board, and the board to print", "calibrate"),
+    "calibrate": Command(
+        "a camera from the motion of any video, or from a recording of a board",
+        "calibrate",
+        "improvo.self_calibration.settings:SelfCalibrationSettings",
+        figures=True,
+    ),
     "simulate": Command(
         "render rooms with exact depth, poses and causes of instability",
         "simulate",

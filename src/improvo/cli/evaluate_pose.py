@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments, add_truth_argument
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import figures, next_step, say
@@ -185,6 +186,8 @@ def _settings(arguments: argparse.Namespace) -> tuple[PoseSettings, list[Recorde
     from improvo.evaluation.pose.gaps import is_slow, with_gaps_in_frames
 
     settings = settings_from(PoseCommandSettings, arguments, _FLAGS, _gap_settings(arguments))
+    output = arguments.output if arguments.export_images is None else None
+    settings = with_found_camera(settings, arguments.sequences, output, COMMAND)
     sources = recorded_sequences(arguments, settings.sequence)
     chosen = settings.pose
     sequences = [source.open() for source in sources]

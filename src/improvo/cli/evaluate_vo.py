@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.evaluate_options import (
     add_frontend_arguments,
     add_run_arguments,
@@ -60,6 +61,7 @@ def run(arguments: argparse.Namespace) -> int | None:
     output: Path | None = arguments.output
     if output is not None:
         check_output_folder(output, COMMAND)
+    settings = with_found_camera(settings, arguments.sequences, output, COMMAND)
     frontends, _ = loaded_frontends(arguments.frontend, settings.max_keypoints, ["superpoint-vo"])
     sources = recorded_sequences(arguments, settings.sequence)
     with Workers(arguments.workers, progress=True) as workers:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from improvo import __version__
+from improvo import __version__, locations
 from improvo.cli import output
 from improvo.cli.commands import COMMANDS, Command
 from improvo.errors import ImprovoError
@@ -51,11 +51,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = parser_for(words).parse_args(words)
         _check_paths(arguments)
         with output.configured(arguments.quiet, getattr(arguments, "json", False)), termination_interrupts():
-            return int(arguments.run_command(arguments) or 0)
+            status = int(arguments.run_command(arguments) or 0)
+            locations.close()
+            return status
     except ImprovoError as error:
-        print(f"improvo: {error}", file=sys.stderr)
+        print(f"improvo: {locations.with_urls(str(error))}", file=sys.stderr)
+        locations.close(success=False)
         return 2
     except KeyboardInterrupt:
+        locations.close(success=False)
         print("improvo: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:

@@ -10,11 +10,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.flags import add_setting
 from improvo.cli.options import (
     add_config_arguments,
     add_frontend_arguments,
     add_sequence_arguments,
+    folder_path,
     recording_path,
     settings_from,
 )
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 
 NO_RESULT = 3  # exit status where everything was read, and no frame has a pose
 _WARNINGS = 5  # printed; run.json has them all
+_UNSAID = ("initialising", "segment", "doubtful", "uncertain")  # kinds of events that other lines say
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "sequence", type=recording_path, metavar="SEQUENCE", help="a video, an image folder, a data set, or `demo`"
     )
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
+    parser.add_argument("-o", "--output", type=folder_path, required=True, metavar="OUT", help="folder for the results")
     add_frontend_arguments(parser, defaults)
     add_setting(parser, defaults, "--mode", "odometry.mode", choices=("robust", "paper"))
     parser.add_argument(
@@ -72,11 +75,13 @@ def run(arguments: argparse.Namespace) -> int:
     extra += scale_settings(arguments.scale) if arguments.scale else []
     settings = settings_from(DenseRunSettings, arguments, extra=extra)
     from improvo.files import check_output_folder
+    from improvo.folder_lock import working_in
     from improvo.frontend.registry import check_frontend
     from improvo.sequences import open_sequence
 
     check_frontend(settings.frontend.name, settings.frontend.network)
     check_output_folder(arguments.output, "run")
+    settings = with_found_camera(settings, [arguments.sequence], arguments.output, "run")
     sequence = open_sequence(arguments.sequence, settings.sequence)
     if settings.dense:
         from improvo.depth.dense import refuse_live
@@ -92,6 +97,12 @@ def run(arguments: argparse.Namespace) -> int:
     for note in sequence.notes:
         say(f"note: {note}")
     ask = _scale_source(sequence, settings)
+    with working_in(arguments.output, "run"):
+        return _tracked(arguments, sequence, settings, ask)
+
+
+def _tracked(arguments: argparse.Namespace, sequence: Sequence, settings: DenseRunSettings, ask: Ask | None) -> int:
+    """Everything that is written; 130 after an interrupt."""
     summary = _track(sequence, arguments.output, settings, _viewer(arguments))
     if ask is not None:
         summary = _in_metres(sequence, summary, ask, settings)
@@ -150,6 +161,7 @@ def _track(sequence: Sequence, folder: Path, settings: DenseRunSettings, viewer:
     """The run with its progress."""
     from improvo.labeling.labeler import run_and_label
     from improvo.odometry.compile import compile_odometry
+    from improvo.self_calibration.found_cameras import with_camera_note
     from improvo.terminal import progress
 
     compile_odometry(notice)
@@ -159,7 +171,8 @@ def _track(sequence: Sequence, folder: Path, settings: DenseRunSettings, viewer:
             shown.note("no pose yet" if frame.cam_from_world is None else "")
             shown.advance()
 
-        return run_and_label(sequence, folder, settings, visualizer=viewer, progress=told)
+        run = run_and_label(sequence, folder, settings, visualizer=viewer, progress=told)
+    return with_camera_note(run, settings.sequence.camera)
 
 
 def _add_depth(sequence: Sequence, summary: LabeledRun, settings: DenseRunSettings) -> bool:
@@ -201,6 +214,7 @@ def _scale_lines(report: dict[str, Any]) -> list[str]:
 
 def _print_summary(summary: LabeledRun) -> None:
     from improvo.odometry.run_folder import why_no_pose
+    from improvo.odometry.told_verdicts import verdict_lines
 
     report = summary.report
     frames, segments = report["frames"], report["segments"]
@@ -212,9 +226,9 @@ def _print_summary(summary: LabeledRun) -> None:
     for segment in segments[1:] if len(segments) > 1 else []:
         own = "" if report.get("metric") else "own scale, "
         say(f"  segment {segment['number']} starts at frame {segment['first']}: {own}placed by guess")
-    for line in _scale_lines(report):
+    for line in [*verdict_lines(report), *_scale_lines(report)]:
         say(f"  {line}")
-    warnings = [event for event in report["events"] if event["kind"] in ("lost", "contradiction")]
+    warnings = [event for event in report["events"] if event["kind"] not in _UNSAID]
     for event in warnings[:_WARNINGS]:
         say(f"  frame {event['frame_index']}: {event['kind']}: {event['detail']}")
     if len(warnings) > _WARNINGS:

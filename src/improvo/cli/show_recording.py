@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import next_step, say
 from improvo.cli.show_options import (
@@ -121,4 +122,5 @@ def _opened_sequence(arguments: argparse.Namespace) -> tuple[Sequence, str | Non
     if (path / "run.json").is_file():
         run_folder = RunFolder(path)
         return run_folder.sequence, str(run_folder.report["configuration"]["frontend"]["name"])
-    return open_sequence(path, settings_from(RunSettings, arguments).sequence), None
+    settings = with_found_camera(settings_from(RunSettings, arguments), [path], None, "show")
+    return open_sequence(path, settings.sequence), None

@@ -29,6 +29,8 @@ class Estimate:
     memory_mib: float
     disk_mib: float
     steps: int
+    labeled_frames: int  # over all rounds
+    other_minutes: float  # of depth, training and validation
 
     @property
     def words(self) -> str:
@@ -66,16 +68,12 @@ def estimate(
     each = 60 * settings.minutes if settings.minutes else steps * step
     validation = 0.12 * size * held_back * 2 + 3 * settings.validation.matches.pairs * _SECONDS_PER_PAIR
     frames = (2 if settings.recipe == HELD else 1) * (training + held_back) + (rounds - 1) * training
-    seconds = (
-        frames * _SECONDS_PER_FRAME * size
-        + deep * _SECONDS_PER_DEPTH * size
-        + trainings * each
-        + (1 + trainings) * validation
-    )
+    others = deep * _SECONDS_PER_DEPTH * size + trainings * each + (1 + trainings) * validation
+    seconds = frames * _SECONDS_PER_FRAME * size + others
     small = min(pixels, settings.held.longer_side**2 * 3 // 4)
     memory = _TORCH_MIB + min(training, reference.most_training) * (2.5 * small + 4 * pixels / 4) / _MIB
     disk = 60 + 0.1 * (training + held_back) * (1 + trainings) + deep * pixels / 4 * 1.3 / _MIB + 12 * trainings
-    return Estimate(seconds / 60, memory, disk, steps)
+    return Estimate(seconds / 60, memory, disk, steps, frames, others / 60)
 
 
 def refuse_full_disk(folder: Path, needed: Estimate) -> None:

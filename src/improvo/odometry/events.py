@@ -35,7 +35,7 @@ class EventLog:
     def segment_started(self, frame_index: int, number: int) -> None:
         """A map has started; the first segment is not worth an event."""
         if number > 0:
-            self._add(frame_index, "segment", f"segment {number + 1} starts: own scale, placed by guess")
+            self._add(frame_index, "segment", f"segment {number} starts: own scale, placed by guess")
         self._last_failure = ""
 
     def initialisation_failed(self, frame_index: int, reason: str) -> None:
@@ -74,7 +74,7 @@ class EventLog:
         """The running map lies in the world of a segment that ended before."""
         scale = f"scale ±{100 * join.scale_error:.1g} %"
         self._add(
-            frame_index, "bridged", f"joined with segment {join.number + 1}: {join.points} of its points found, {scale}"
+            frame_index, "bridged", f"joined with segment {join.number}: {join.points} of its points found, {scale}"
         )
 
     def judged(self, segment: Segment) -> None:
@@ -82,7 +82,7 @@ class EventLog:
         for first, last in segment.verdict.uncertain:
             self._add(first, "uncertain", f"the scale is not determined between frames {first} and {last}")
         if segment.verdict.word == DOUBTFUL:
-            self._add(segment.last, "doubtful", f"segment {segment.number + 1}: {segment.verdict.evidence[0]}")
+            self._add(segment.last, "doubtful", f"segment {segment.number}: {segment.verdict.evidence[0]}")
 
     def _add(self, frame_index: int, kind: str, detail: str) -> None:
         self.events.append(Event(frame_index, kind, detail))

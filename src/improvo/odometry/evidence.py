@@ -31,6 +31,8 @@ PARTS = (*QUARTERS, *HALVES)
 
 _SOLVER = SolverSettings(max_iterations=8, relative_decrease=1e-3)
 _FEW = 8  # observations or common points; fewer determine nothing
+_THIN = 6  # points seen on both sides of a gap between two keyframes; fewer carry no scale across it
+_UNDETERMINED = 0.11  # change of the logarithm of the scale that then counts, at least: enough for a mark
 _HASH = 2654435761  # a multiplier of Knuth's, so that the halves of the points are no halves of time or place
 
 
@@ -178,7 +180,10 @@ class EvidenceCheck:
         steps = np.zeros(len(PARTS))
         for part, (path, mask) in enumerate(zip(self._paths, self._masks(window), strict=True)):
             steps[part] = _continue(path, self._solved(window, mask), window, self._overlap)
-        if self._overlap:
+        thin = _fewest_across(window) < _THIN
+        if thin:
+            steps = np.maximum(np.abs(steps), _UNDETERMINED)
+        if self._overlap or thin:
             self._scale_steps.append(steps)
             self._links.append((keyframes[0].frame_index, keyframes[-1].frame_index))
         self._overlap = min(self._settings.window // 2, len(keyframes))
@@ -243,6 +248,20 @@ def _errors(window: _Window, camera: Camera) -> Float64:
     in_camera += window.cam_from_world[window.camera, :3, 3]
     front = in_camera[:, 2] > 0
     return np.asarray(np.linalg.norm(camera.project(in_camera[front]) - window.keypoints[front], axis=1))
+
+
+def _fewest_across(window: _Window) -> int:
+    """Points that are seen before and after a gap between two keyframes, at the gap with the fewest.
+
+    Two observations fix no depth and a scale needs one, so a point counts with three.
+    """
+    count, point, camera = len(window.cam_from_world), window.point, window.camera
+    first, last = np.full(len(window.ids), count), np.full(len(window.ids), -1)
+    np.minimum.at(first, point, camera)
+    np.maximum.at(last, point, camera)
+    known = np.bincount(point, minlength=len(window.ids)) >= min(3, count)
+    begins, ends = (np.bincount(edge[known], minlength=count) for edge in (first, last))
+    return int((np.cumsum(begins) - np.cumsum(ends))[:-1].min())
 
 
 def _continue(path: _Path, solution: _Solution, window: _Window, overlap: int) -> float:

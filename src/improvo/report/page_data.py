@@ -51,6 +51,7 @@ def scene_data(run: RunFolder, palette: Palette) -> dict[str, Any]:
         "poses": _base64(poses.astype("<f4")),
         "frame_indices": run.frame_indices.tolist(),
         "segments": trajectory.segment.tolist(),
+        "doubted": (run.doubtful | run.uncertain).tolist(),
         "frames": run.frames,
         "last": min(LAST_POSES, max(len(trajectory) - 1, 0)),
         "centre": centre,

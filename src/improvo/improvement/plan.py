@@ -1,0 +1,66 @@
+"""What the loop will cost: its labelling measured on a sample, the rest by the figures of `estimate`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from improvo.errors import InputError
+from improvo.frontend.weights import load_weights
+from improvo.improvement.estimate import Estimate, estimate
+from improvo.improvement.rounds import starting_weights
+from improvo.improvement.settings import ImproveSettings
+from improvo.labeling.plan import LabelPlan, plan_labels
+from improvo.sequences import open_sequence
+
+
+@dataclass(frozen=True)
+class ImprovePlan:
+    """Of some rounds."""
+
+    once: LabelPlan  # all recordings labelled once, by the frontend at the start
+    needed: Estimate
+
+    @property
+    def labelings(self) -> float:
+        """How often all recordings are labelled, over all rounds; parts of them more often than others."""
+        return self.needed.labeled_frames / max(self.once.frames, 1)
+
+
+def plan_improvement(
+    sequences: Sequence[Path],
+    settings: ImproveSettings,
+    rounds: int,
+    evaluate: Sequence[Path] = (),
+    on_frames: Callable[[int], None] = lambda count: None,
+) -> ImprovePlan:
+    """Label a sample with the weights that the loop starts from, and reckon.
+
+    Args:
+        sequences, settings, rounds, evaluate: see `improve`.
+        on_frames: is told the number of further frames of the sample processed.
+
+    Raises:
+        InputError: none of the samples could be labelled, or weights that cannot be read.
+    """
+    weights = starting_weights(settings.frontend.name)
+    frontend = replace(settings.frontend, name=str(weights))
+    paths = list(dict.fromkeys([*sequences, *evaluate]))
+    once = plan_labels(paths, settings.run_settings(settings.sequence, frontend), on_frames=on_frames)
+    held_back = round(once.frames * (len(evaluate) / len(paths) if evaluate else settings.split.share))
+    pixels = _pixels(paths, settings)
+    parameters = sum(tensor.size for tensor in load_weights(weights).tensors.values())
+    return ImprovePlan(once, estimate(settings, rounds, once.frames - held_back, held_back, pixels, parameters))
+
+
+def _pixels(paths: Sequence[Path], settings: ImproveSettings) -> int:
+    """Of a frame of the first recording that can be opened."""
+    for path in paths[:-1]:
+        try:
+            camera = open_sequence(path, settings.sequence).camera
+        except InputError:
+            continue
+        return camera.width * camera.height
+    camera = open_sequence(paths[-1], settings.sequence).camera
+    return camera.width * camera.height
