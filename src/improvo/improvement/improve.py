@@ -18,6 +18,7 @@ from improvo.folder_lock import locked
 from improvo.frontend.weights import load_weights, save_weights
 from improvo.improvement.estimate import refuse_full_disk
 from improvo.improvement.folder import COMMAND, Candidate, ImproveFolder
+from improvo.improvement.plan import first_estimate
 from improvo.improvement.progress import ImprovementProgress
 from improvo.improvement.recipe import Train, TrainingJob
 from improvo.improvement.reference import ReferencePart
@@ -79,12 +80,13 @@ def improve(
     with locked(output):
         folder = ImproveFolder(output, sequences, evaluate, settings, first_weights)
         loop = Rounds(folder, settings, train or _train, data, workers, ray, progress)
+        needed = first_estimate(sequences, settings, rounds, evaluate)
+        if needed is not None:
+            progress.line(f"estimate: {needed.words}")
+            refuse_full_disk(output, needed)
         split = loop.split(sequences, evaluate, first_weights)
         progress.split(split)
         start = loop.start(first_weights, split.training)
-        needed = loop.estimate(start, split, rounds)
-        progress.line(f"estimate: {needed.words}")
-        refuse_full_disk(output, needed)
         teaching, judging = loop.reference(split)
         result = Improvement(folder.weights, 0, (start,), (loop.validate(start, split.held_back, judging),))
         progress.validated(start, result.validations[0], result.validations[0], settings.validation)
