@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from improvo import locations
 from improvo.errors import InputError, OutputError
 from improvo.formats import FORMAT, FORMAT_KEY, check_format
 from improvo.untrusted.paths import check_path
@@ -49,6 +50,8 @@ def written_atomically(path: Path) -> Iterator[Path]:
         _open_here.add(temporary.name)
         yield temporary
         os.replace(temporary, path)
+        made = False
+        locations.written(path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error}); choose another folder") from None
     finally:
@@ -72,7 +75,7 @@ def clear_leftovers(folder: Path) -> None:
         for name in [*names, *folders]:
             match = _TEMPORARY.fullmatch(name)
             leftover = Path(place) / name
-            if match is None or name in _open_here or _is_in_use(leftover, match):
+            if match is None or is_being_written(leftover):
                 continue
             if leftover.is_dir() and not leftover.is_symlink():
                 shutil.rmtree(leftover, ignore_errors=True)
@@ -81,15 +84,18 @@ def clear_leftovers(folder: Path) -> None:
                     leftover.unlink(missing_ok=True)
 
 
-def _is_in_use(path: Path, match: re.Match[str]) -> bool:
-    """Whether the process that made this temporary file may still write it."""
+def is_being_written(path: Path) -> bool:
+    """Whether this is a temporary file or folder, and the process that made it may still write it."""
+    match = _TEMPORARY.fullmatch(path.name)
+    if match is None:
+        return False
     process, token = int(match.group(1)[:9]), match.group(2) or ""
-    if len(token) == len(_HOST) + 8 and not token.startswith(_HOST):  # on a shared file system
+    if len(token) == len(_HOST) + 8 and not token.startswith(_HOST):  # of another machine, on a shared file system
         try:
             return time.time() - path.lstat().st_mtime < _FOREIGN_SECONDS
         except OSError:
             return True
-    return _is_running(process)
+    return path.name in _open_here or _is_running(process)
 
 
 def _is_running(process: int) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import socket
 import threading
 import time
@@ -17,7 +18,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from improvo.errors import OutputError
+from improvo.errors import ImprovoError, OutputError
+from improvo.files import MARKER, make_output_folder
 
 LOCK = ".improvo.lock"
 _BEAT_SECONDS = 5.0
@@ -56,6 +58,29 @@ def locked(folder: Path) -> Iterator[None]:
     """
     with claimed(folder / LOCK, folder):
         yield
+
+
+@contextmanager
+def working_in(folder: Path, command: str) -> Iterator[None]:
+    """Make an output folder, and be the only one to work there within the block.
+
+    A folder that was not there before and in which nothing was written is removed where the block fails.
+
+    Args:
+        folder, command: see `make_output_folder`.
+
+    Raises:
+        OutputError: the folder cannot be used; a `BusyError` if another process is at work there.
+    """
+    new = not folder.exists()
+    make_output_folder(folder, command)
+    try:
+        with locked(folder):
+            yield
+    except ImprovoError:
+        if new and [path.name for path in folder.iterdir()] == [MARKER]:
+            shutil.rmtree(folder)
+        raise
 
 
 @contextmanager
@@ -172,6 +197,30 @@ class _LockFile:
         while not self._released.wait(_BEAT_SECONDS):
             with suppress(OSError):
                 os.utime(self._file)
+
+
+def seems_held(file: Path) -> bool:
+    """Whether somebody holds a lock, said at once; a holder on another machine may have died since."""
+    if file.resolve() in _held:
+        return True
+    try:
+        descriptor = os.open(file, os.O_RDWR)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    try:
+        by_system = _lock(descriptor)
+        holder = _parsed(os.pread(descriptor, _LONGEST, 0))
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    if not holder:
+        return False
+    if holder.get("host") == socket.gethostname():
+        return not by_system and _is_running(holder.get("process"))
+    return True
 
 
 def holder_of(file: Path) -> str:

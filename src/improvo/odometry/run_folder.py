@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -150,6 +150,9 @@ class RunFolder:
     def sequence(self) -> Sequence:
         """The recording, opened as it was for the run."""
         settings = config.from_dict(SequenceSettings, self.report["configuration"]["sequence"], "run.json")
+        own = self.path / "camera.yaml"  # found for this run (`--camera auto`), which may have been moved
+        if settings.camera is not None and own.is_file() and Path(settings.camera).name == own.name:
+            settings = replace(settings, camera=str(own))
         path = self._sequence_path or self._recorded_input
         if not path.exists():
             raise InputError(f"{path}: the recording is not there any more; name it with --sequence PATH")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from improvo.errors import InputError
+from improvo.locations import fetched
 from improvo.untrusted.arrays import check_array
 from improvo.untrusted.limits import MAX_TABLE_BYTES
 from improvo.untrusted.text import reason
@@ -55,7 +56,7 @@ def _reading(path: Path, schema: pa.Schema, read: Callable[[Any], Found]) -> Fou
     import pyarrow.parquet as pq
 
     try:
-        with pq.ParquetFile(path) as file:
+        with pq.ParquetFile(fetched(path)) as file:
             missing = [name for name in schema.names if name not in file.schema_arrow.names]
             if missing:
                 raise InputError(f"{path}: lacks the column(s) {', '.join(missing)}; write it again with this version")
