@@ -13,6 +13,7 @@ from improvo.odometry.settings import VerdictSettings
 from improvo.types import Float64
 
 _SIGMAS = 5.0  # standard errors that a deviation of the focal length must exceed
+_SIGMAS_OF_GROWTH = 8.0  # its change within a window, which a step ahead imitates; 6.7 at most in right recordings
 _LARGEST_LENS_ERROR = 0.06  # of the logarithm of a focal length; a window that knows it less well says nothing of it
 RIGHT, DOUBTFUL, NOT_JUDGED = "right", "doubtful", "not judged"
 
@@ -112,7 +113,7 @@ def _lens_alarms(spread: Spread, settings: VerdictSettings) -> tuple[str, ...]:
     sure = [each for each in spread.lens if each.offset_error < _LARGEST_LENS_ERROR]
     for each in spread.lens:
         first, last = each.frames
-        if abs(each.growth) > max(settings.max_focal_change, _SIGMAS * each.growth_error):
+        if abs(each.growth) > max(settings.max_focal_change, _SIGMAS_OF_GROWTH * each.growth_error):
             alarms.append(_told(first, last, f"changes by {100 * abs(np.expm1(each.growth)):.0f} %"))
     for each in sure:
         first, last = each.frames
