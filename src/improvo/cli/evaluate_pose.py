@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments, add_truth_argument
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import figures, next_step, say
 from improvo.errors import ConfigError, ImprovoError, InputError
 from improvo.evaluation.settings import ESTIMATORS, USUAL_OVERLAPS, PoseCommandSettings, PoseSettings
@@ -42,7 +42,9 @@ _FLAGS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `improvo evaluate pose`."""
     defaults, absent = PoseSettings(), argparse.SUPPRESS
-    parser.add_argument("sequences", nargs="*", type=Path, metavar="SEQUENCE", help="with depth and true poses")
+    parser.add_argument(
+        "sequences", nargs="*", type=recording_path, metavar="SEQUENCE", help="with depth and true poses"
+    )
     add_truth_argument(parser)
     add_frontend_arguments(parser, defaults.max_keypoints)
     parser.add_argument(

@@ -18,6 +18,7 @@ from improvo.cli.options import (
     add_sequence_arguments,
     check_recordings,
     folder_path,
+    recording_path,
     settings_from,
 )
 from improvo.cli.output import figures, next_step, notice, say
@@ -34,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `improvo improve`."""
     defaults = ImproveSettings()
     parser.add_argument(
-        "sequences", type=Path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
+        "sequences", type=recording_path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
     )
     parser.add_argument(
         "-o", "--output", type=folder_path, metavar="OUT", help="folder; an unfinished one is continued"
@@ -50,6 +51,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="SEQUENCE",
         help="held out for validation (default: one sequence in five, or the last fifth of a single one)",
+    )
+    parser.add_argument(
+        "--after",
+        type=Path,
+        metavar="FOLDER",
+        help="finished OUT of an earlier run: starts from its weights; recordings that it had are replayed and must "
+        "not get worse, the others are new",
     )
     add_job_arguments(parser)
     add_data_card(parser)
@@ -128,6 +136,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.ray,
         data,
         ImprovementProgress(say, shown=not output.as_json()),
+        after=arguments.after,
     )
     kept = result.candidates[result.best].name
     figures({"weights": str(result.weights), "best": result.best, "kept": kept}, "")

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from improvo.cli.auto_camera import with_found_camera
@@ -19,6 +18,7 @@ from improvo.cli.options import (
     add_sequence_arguments,
     check_recordings,
     folder_path,
+    recording_path,
     settings_from,
 )
 from improvo.cli.output import figures, next_step, notice, say
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `improvo label`."""
     defaults = LabelRunSettings()
     parser.add_argument(
-        "sequences", type=Path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
+        "sequences", type=recording_path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
     )
     parser.add_argument("-o", "--output", type=folder_path, metavar="LABELS", help="folder of the label store")
     parser.add_argument(

@@ -115,7 +115,7 @@ def _tracked(arguments: argparse.Namespace, sequence: Sequence, settings: DenseR
         from improvo.report.pages import write_report
 
         write_report(arguments.output, arguments.output / "report.html")
-        say(f"page in {arguments.output / 'report.html'}")
+        next_step(f"open {arguments.output / 'report.html'}, or draw `improvo show labels {arguments.output}`")
     elif summary.tracked:
         next_step(
             f"`improvo report {summary.folder}` makes a page of it, `improvo show map {summary.folder}` a picture"

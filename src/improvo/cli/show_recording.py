@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from improvo.cli.auto_camera import with_found_camera
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import next_step, say
 from improvo.cli.show_options import (
     add_frames,
@@ -107,7 +107,7 @@ def run_matches(arguments: argparse.Namespace) -> None:
 
 
 def _add_recording(parser: argparse.ArgumentParser, default: str) -> None:
-    parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a recording, or the folder of a run")
+    parser.add_argument("sequence", type=recording_path, metavar="SEQUENCE", help="a recording, or the folder of a run")
     add_target(parser, default)
     add_palette(parser)
 

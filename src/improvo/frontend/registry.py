@@ -68,8 +68,13 @@ def check_frontend(name: str, network: NetworkOptions | None = None) -> None:
     Raises:
         ConfigError: an unknown name, or network options for a classical frontend.
         InputError: a weights file that is not there.
+        MissingExtraError: `surf` without the package mahotas.
     """
     if name in CLASSICAL:
+        if name == "surf":
+            from improvo.frontend.classical import SurfFrontend
+
+            SurfFrontend()  # whether what it needs is installed
         if network not in (None, NetworkOptions()):
             raise ConfigError(
                 f"frontend {name}: is not a network, so the settings `frontend.network` do not apply to it"
