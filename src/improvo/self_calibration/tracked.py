@@ -20,7 +20,7 @@ from improvo.sequences.rectification import Rectifier
 from improvo.types import Features, Float64, Int64, Mask, SparseMap, UInt8
 
 _WORLDS = 100_000  # more than a piece has segments
-_STEP = 0.03  # motion of the median point between two selected views, as a share of the width
+_STEPS = (0.03, 0.015, 0.008)  # motion of the median point between two views, shares of the width; until enough
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,11 @@ def scene_of(pieces: list[TrackedPiece], lens: Lens, max_views: int) -> Scene:
         lens: where the adjustment starts from.
         max_views: of all pieces together.
     """
-    chosen = [_different_views(piece, lens.width) for piece in pieces]
-    total = sum(map(len, chosen))
+    for step in _STEPS:
+        chosen = [_different_views(piece, step * lens.width) for piece in pieces]
+        total = sum(map(len, chosen))
+        if total > max_views / 2:
+            break
     chosen = [
         rows[np.unique(np.linspace(0, len(rows) - 1, max(2, round(len(rows) * max_views / total))).astype(int))]
         if total > max_views and len(rows)
@@ -133,8 +136,8 @@ def _motion(views: list[FinalView], row: int) -> Float64:
     return np.concatenate([last_from_first[:3, 3], turn]) / seconds
 
 
-def _different_views(piece: TrackedPiece, width: int) -> Int64:
-    """Rows of views, each of which moved by a share of the picture since the one before."""
+def _different_views(piece: TrackedPiece, step: float) -> Int64:
+    """Rows of views, each of which moved by so many pixels since the one before."""
     chosen: list[int] = []
     for row, view in enumerate(piece.views):
         if not chosen or view.segment != piece.views[chosen[-1]].segment:
@@ -144,7 +147,7 @@ def _different_views(piece: TrackedPiece, width: int) -> Int64:
         _, here, there = np.intersect1d(view.points, last.points, return_indices=True)
         seen = view.points[here] >= 0
         moved = np.linalg.norm(piece.pixels[row][here[seen]] - piece.pixels[chosen[-1]][there[seen]], axis=1)
-        if len(moved) == 0 or float(np.median(moved)) > _STEP * width:
+        if len(moved) == 0 or float(np.median(moved)) > step:
             chosen.append(row)
     return np.array(chosen, np.int64)
 
