@@ -32,8 +32,10 @@ from improvo.evaluation.measures import PairGeometry, relative_motion, right_mat
 from improvo.evaluation.pose.self_truth import FixedRun, choose_pairs
 from improvo.evaluation.statistics import Bootstrap
 from improvo.frontend.registry import load_frontend
+from improvo.frontend.weights import find_weights, load_weights
 from improvo.improvement.gaps import choose_gaps
 from improvo.improvement.reference import HELD_BACK, ReferencePart, reference_parts
+from improvo.improvement.rounds import calibration_images, write_calibrated
 from improvo.improvement.settings import ValidationSettings
 from improvo.improvement.split import read_split
 from improvo.sequences import open_sequence
@@ -82,6 +84,16 @@ def _set(part: ReferencePart, folder: Path, gaps: tuple[int, ...], most: int) ->
 
     pairs = {name: found for name, found in pairs.items() if len(found)}
     return Set(f"{part.name} ({folder.name})", part, pairs, geometry)
+
+
+def calibrated(weights: Path, folder: Path, keep: Path) -> Path:
+    """Weights with activation ranges, which all others have: measured on frames that were trained on where missing."""
+    if load_weights(find_weights(str(weights))).card.activation_ranges:
+        return weights
+    target = keep / f"{'-'.join(weights.with_suffix('').parts[-2:])}.safetensors"
+    if not target.is_file():
+        write_calibrated(weights, target, calibration_images(read_split(folder / "split.json").training, 24))
+    return target
 
 
 def _true_run(part: ReferencePart) -> FixedRun | None:
@@ -194,7 +206,7 @@ def main() -> None:
                     file = keep / folder.name / f"{name.replace(' ', '-')}.json"
                     if not file.is_file():
                         file.parent.mkdir(parents=True, exist_ok=True)
-                        file.write_text(json.dumps(shares(chosen, path)))
+                        file.write_text(json.dumps(shares(chosen, calibrated(path, folder, file.parent))))
                     found[name] = json.loads(file.read_text())
                 print(f"\n{chosen.name}: pairs " + ", ".join(f"{name}: {len(p)}" for name, p in chosen.pairs.items()))
                 if arguments.only:

@@ -9,18 +9,24 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from rendered_walk import write_walk
 
+from improvement_example import SETTINGS
 from improvo import locations
 from improvo.cli.main import main
 from improvo.errors import InputError, OutputError
 from improvo.files import write_text
+from improvo.frontend.settings import FrontendSettings
+from improvo.labeling.label_sequences import LabelJob, label_sequence
 from improvo.labeling.labeled import read_labels
 from improvo.locations import fetched, is_remote, local_folder, publish, with_urls
+from improvo.odometry.run_settings import LabelRunSettings
+from improvo.stability.settings import LabelSettings
 from labeled_scene import write_labeled_scene
 
 fsspec = pytest.importorskip("fsspec", reason="locations need the extra `remote`")
@@ -191,6 +197,34 @@ def test_training_in_memory(memory: str, tmp_path: Path, cache: Path, capsys: py
 
 def test_training_on_s3(s3: str, tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     check_training(s3, tmp_path, cache, capsys)
+
+
+def test_a_loop_goes_on_elsewhere(memory: str, tmp_path: Path, cache: Path) -> None:
+    pytest.importorskip("torch", reason="training needs the extra `train`")
+    from improvement_example import FakeTraining
+    from improvement_example import run as improve
+
+    walk = write_walk(tmp_path / "room", frames=30, seed=3)
+    settings = replace(SETTINGS, frontend=replace(SETTINGS.frontend, name="superpoint-small"))
+    first, second = FakeTraining(), FakeTraining()
+    improve(local_folder(f"{memory}/better"), [walk], first, rounds=1, settings=settings)
+    publish(local_folder(f"{memory}/better"))
+    weights = fsspec.filesystem("memory").cat_file("/bucket/work/better/weights.safetensors")
+    forget(cache)
+    result = improve(local_folder(f"{memory}/better"), [walk], second, rounds=1, settings=settings)
+    assert (len(first.calls), len(second.calls)) == (1, 0)
+    assert result.weights.read_bytes() == weights
+
+
+def test_a_worker_on_another_machine_labels_into_the_location(memory: str, tmp_path: Path, cache: Path) -> None:
+    walk = write_walk(tmp_path / "attic", frames=16, seed=0)
+    elsewhere = tmp_path / "no" / "such" / "folder"
+    network = FrontendSettings(name="orb", max_keypoints=200)
+    settings = LabelRunSettings(frontend=network, labels=LabelSettings(min_observations=6))
+    record = label_sequence(LabelJob("attic", walk, elsewhere, settings, False, memory), lambda: None)
+    assert record.tracked > 10
+    assert {"attic/label.json", "attic/tracks.parquet"} <= names(memory)
+    assert not elsewhere.exists()
 
 
 class Failing:

@@ -16,6 +16,7 @@ from improvo.self_calibration.first_guess import agreement, far_pairs, guesses
 from improvo.self_calibration.from_motion import CameraFromMotion, LensFound, lens_of_pieces, refuse_unsure
 from improvo.self_calibration.lens import MODELS, NAMES, Lens, lens_of, lens_with_fov
 from improvo.self_calibration.raw_features import Piece, piece_rows
+from improvo.self_calibration.rejoining import SceneView, rejoined
 from improvo.self_calibration.settings import SelfCalibrationSettings
 from improvo.types import Features, Float64
 
@@ -35,13 +36,28 @@ def scene(lens: Lens, seed: int, views: int = 16, points: int = 300, noise: floa
     return observed(lens, poses, xyz, rng, noise)
 
 
-def observed(lens: Lens, poses: Float64, xyz: Float64, rng: np.random.Generator, noise: float) -> Scene:
+def observed(
+    lens: Lens,
+    poses: Float64,
+    xyz: Float64,
+    rng: np.random.Generator,
+    noise: float,
+    motion: Float64 | None = None,
+    readout: float = 0.0,
+) -> Scene:
     point, view = (each.ravel() for each in np.indices((len(xyz), len(poses))))
     points_cam = np.einsum("mij,mj->mi", poses[view, :3, :3], xyz[point]) + poses[view, :3, 3]
-    pixels = lens.project(points_cam)[0]
+    motion = np.zeros((len(poses), 6)) if motion is None else motion
+    moved, pixels = points_cam, lens.project(points_cam)[0]
+    for _ in range(5):  # the row decides when a point was seen, and that decides the row
+        when = (pixels[:, 1] - (lens.height - 1) / 2) / lens.height * readout
+        speed = motion[view, :3] + np.cross(motion[view, 3:], points_cam)
+        moved = points_cam + when[:, None] * speed
+        pixels = lens.project(moved)[0]
     seen = (pixels > 0).all(axis=1) & (pixels < (lens.width, lens.height)).all(axis=1) & (rng.random(len(view)) < 0.5)
     pixels = pixels[seen] + rng.normal(scale=noise, size=(int(seen.sum()), 2))
-    whole = Scene(lens, poses, xyz, view[seen], point[seen], pixels)
+    world = np.zeros(len(poses), np.int64)
+    whole = Scene(lens, poses, xyz, view[seen], point[seen], pixels, world, motion)
     return whole.without(np.zeros(len(pixels), bool))
 
 
@@ -70,11 +86,17 @@ def piece(world: World, motion: Float64, lens: Lens = SMALL, noise: float = 0.3,
 
 def result(found: LensFound) -> CameraFromMotion:
     """What the whole search would say of it."""
-    deviations = np.sqrt(np.diag(found.adjusted.covariance)).tolist()
+    *deviations, readout = np.sqrt(np.diag(found.adjusted.covariance)).tolist()
     lens = found.adjusted.scene.lens
     counts = {"frames": 60, "tracked": found.tracked, "views": 30, "points": 500, "observations": 5000}
     return CameraFromMotion(
-        lens.camera, dict(zip(NAMES, deviations, strict=True)), found.adjusted.rms, fov=lens.fov, **counts
+        lens.camera,
+        dict(zip(NAMES, deviations, strict=True)),
+        found.adjusted.rms,
+        fov=lens.fov,
+        readout=found.adjusted.scene.readout,
+        readout_deviation=readout,
+        **counts,
     )
 
 
@@ -127,11 +149,23 @@ def test_a_known_lens_is_recovered_to_its_deviation(lens: Lens) -> None:
     shares = []
     for seed in range(4):
         found = adjusted(disturbed(scene(lens, seed), start, seed))
-        off = (found.scene.lens.values - lens.values) / np.sqrt(np.diag(found.covariance))
+        off = (found.scene.lens.values - lens.values) / np.sqrt(np.diag(found.covariance))[:6]
         assert np.abs(off).max() < 4
         assert np.sqrt(found.covariance[0, 0]) < 0.004 * lens.values[0]
         shares.append(off)
     assert 0.4 < np.sqrt((np.array(shares) ** 2).mean()) < 1.8
+
+
+def test_a_rolling_shutter_is_found_and_does_not_bend_the_lens() -> None:
+    rng = np.random.default_rng(3)
+    still = scene(BROWN, 3)
+    motion = rng.normal(scale=(0.3, 0.3, 0.3, 0.5, 0.5, 0.5), size=(len(still.cam_from_world), 6))
+    truth = observed(BROWN, still.cam_from_world, still.xyz, rng, 0.3, motion, 0.03)
+    found = adjusted(disturbed(truth, lens_with_fov(70, 640, 480), 0))
+    deviation = np.sqrt(np.diag(found.covariance))
+    assert found.scene.readout == pytest.approx(0.03, abs=4 * deviation[6])
+    assert deviation[6] < 0.003
+    assert (np.abs(found.scene.lens.values - BROWN.values) < 4 * deviation[:6]).all()
 
 
 def test_wrong_observations_do_not_move_the_lens() -> None:
@@ -154,7 +188,7 @@ def test_forward_motion_says_that_it_does_not_know() -> None:
 
 def test_the_whole_search_finds_the_lens_of_a_walk() -> None:
     found = lens_of_pieces([piece(room(), hand_motion(60))], 320, 240, SETTINGS)
-    lens, deviation = found.adjusted.scene.lens, np.sqrt(np.diag(found.adjusted.covariance))
+    lens, deviation = found.adjusted.scene.lens, np.sqrt(np.diag(found.adjusted.covariance))[:6]
     assert lens.values[:2] == pytest.approx(SMALL.values[:2], rel=0.01)
     assert (np.abs(lens.values - SMALL.values) < 4 * deviation).all()
     assert found.tracked > 50
@@ -193,6 +227,32 @@ def test_motions_that_do_not_tell_the_camera_are_refused(motion: Float64, world:
     with pytest.raises(InputError, match=r"^video: .*; walk sideways") as error:
         refuse_unsure(result(lens_of_pieces([piece(world, motion)], 320, 240, SETTINGS, "video")), "video", SETTINGS)
     assert "\n" not in str(error.value)
+
+
+def test_points_seen_again_become_one_and_longer() -> None:
+    truth = scene(BROWN, 0, noise=0.0)
+    rng = np.random.default_rng(0)
+    descriptors = rng.normal(size=(len(truth.xyz), 32))
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    views = []
+    for number in range(len(truth.cam_from_world)):
+        here = truth.view == number
+        views.append(SceneView(truth.pixels[here], descriptors[truth.point[here]].astype(np.float32), 0.7, 0))
+    halves = np.where(truth.view < len(views) // 2, truth.point, truth.point + len(truth.xyz))  # as two visits
+    order = np.lexsort((truth.view, halves))
+    split = replace(
+        truth,
+        xyz=np.concatenate([truth.xyz, truth.xyz]),
+        view=truth.view[order],
+        point=halves[order],
+        pixels=truth.pixels[order],
+    ).without(np.zeros(len(order), bool))
+    joined = rejoined(split, views, 5.0)
+    assert len(split.xyz) > 1.5 * len(joined.xyz)
+    # points that neither visit saw three times are gone; the others have all their observations again
+    assert 0.9 * len(truth.xyz) < len(joined.xyz) <= len(truth.xyz)
+    assert len(joined.view) / len(joined.xyz) >= len(truth.view) / len(truth.xyz)
+    assert joined.errors().max() < 1e-6
 
 
 def test_pieces_cover_short_videos_and_sample_long_ones() -> None:

@@ -64,7 +64,8 @@ def test_the_table_says_every_value_with_its_deviation(
     shown = capsys.readouterr().out
     for name in ("fx", "fy", "cx", "cy", "k1", "k2"):
         assert re.search(rf"^  {name}\s+-?[\d.e-]+\s+\+- [\d.]+$", shown, re.MULTILINE), name
-    assert "focal length +- 0.2 %" in shown
+    assert "focal length +- 0.19 %" in shown
+    assert "no rolling shutter" in shown
     assert shown.splitlines()[-1].startswith("next: ")
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["deviations"]["fx"] == 0.5
@@ -77,7 +78,7 @@ def example() -> object:
 
     deviations = dict.fromkeys(NAMES, 0.5)
     camera = improvo.Camera(CAMERA.width, CAMERA.height, 260.0, 260.0, 159.5, 119.5, (0.0, 0.0, 0.0, 0.0))
-    return CameraFromMotion(camera, deviations, 0.4, 45, 45, 25, 300, 3000, 63.0)
+    return CameraFromMotion(camera, deviations, 0.4, 45, 45, 25, 300, 3000, 63.0, 0.0, 0.001)
 
 
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
@@ -103,7 +104,7 @@ def test_run_finds_the_camera_once_and_says_so(
     assert main(words) == 0
     assert "camera from the motion: brown, fx 260.0, fy 260.0 (+- 0.19 %)" in capsys.readouterr().out
     report = json.loads((out / "run.json").read_text())
-    assert report["camera"]["from_motion"]["deviations"]["fx"] == 0.5
+    assert report["camera_from_motion"]["deviations"]["fx"] == 0.5
     assert report["configuration"]["sequence"]["camera"] == str(out / "camera.yaml")
     assert improvo.RunFolder(out).image(0).shape == (240, 320)
     assert main(words) == 0
@@ -150,7 +151,7 @@ def test_python_finds_and_keeps_it_too(walk: Path, tmp_path: Path, monkeypatch: 
         SequenceSettings(camera="auto", max_frames=12), improvo.FrontendSettings("orb", max_keypoints=300)
     )
     run = improvo.run(walk, tmp_path / "out", settings)
-    assert run.report["camera"]["from_motion"]["values"]["fx"] == 260.0
+    assert run.report["camera_from_motion"]["values"]["fx"] == 260.0
     assert (tmp_path / "out" / "camera.yaml").is_file()
     with pytest.raises(InputError, match=r"improvo\.find_camera"):
         improvo.open_sequence(walk, camera="auto")

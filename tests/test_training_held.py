@@ -379,3 +379,25 @@ def test_frozen_layers_and_what_reads_only_them_stay_to_the_bit(tmp_path: Path, 
     assert "descriptor.0.convolution.weight" in changed
     assert any(name.startswith("encoder.") for name in changed) == (frozen < 8)
     assert ("detector" in row) == (frozen < 8)
+
+
+def test_no_pair_of_any_kind_has_a_point_on_a_masked_pixel() -> None:
+    source, room = photographs(), posed_room()
+    left = np.ones((150, 200), np.bool_)
+    left[:, :90] = False
+    below = np.ones((120, 160), np.bool_)
+    below[70:] = False
+    painted = tuple(np.where(left, np.maximum(picture, 80), np.uint8(0)) for picture in source.pictures)
+    shown = tuple(np.where(below, np.maximum(picture, 80), np.uint8(0)) for picture in room.pictures)
+    masked = replace(source, pictures=painted, masks=(left,) * len(painted))
+    seen = replace(room, pictures=shown, masks=(below,) * len(shown))
+    for two_frames in (True, False):
+        settings = replace(SMALL, pairs=replace(SMALL.pairs, two_frames=two_frames))
+        batches = DevicePairs(Pictures((masked,)), [seen], settings, no_keypoints, None, CPU)
+        for step in range(3):
+            batch = batches[step]
+            for pair, valid in enumerate(batch["valid"]):
+                assert valid.any()
+                for name, image in (("points_a", pair), ("points_b", 4 + pair)):
+                    places = batch[name][pair][valid].round().long()
+                    assert (batch["images"][image, 0][places[:, 1], places[:, 0]] > 40).float().mean() > 0.98

@@ -63,6 +63,28 @@ def local_folder(text: str | Path, writing: bool = True) -> Path:
     return folder
 
 
+def url_of(folder: Path) -> str:
+    """The location that a folder of `local_folder` stands for; empty for any other folder."""
+    place = _place_of(folder)
+    return place.url if place is not None and place.folder == folder.absolute() else ""
+
+
+def folder_here(folder: Path, url: str) -> Path:
+    """A folder that another process gave, or one of this machine for the same location, if that is another machine."""
+    return local_folder(url) if url and url_of(folder) != url else folder
+
+
+def refresh(folder: Path) -> None:
+    """Look again what a location has; others may have written to it.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    place = _place_of(folder)
+    if place is not None:
+        place.open()
+
+
 def with_urls(text: str) -> str:
     """A text for a person: locations in place of the folders that stand for them."""
     for folder, place in _places.items():

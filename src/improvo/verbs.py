@@ -220,6 +220,7 @@ def improve(
     rounds: int = 1,
     evaluate: Sequence[PathLike] = (),
     workers: int = 1,
+    after: PathLike | None = None,
 ) -> Improvement:
     """The loop: label, train, validate, and keep the better weights, as `improvo improve` does it.
 
@@ -230,6 +231,7 @@ def improve(
         rounds: of labelling, training and validation.
         evaluate: recordings to hold out; without any, some of `sequences`, or the last part of a single one.
         workers: sequences labelled at a time.
+        after: finished folder of an earlier call, whose recordings are replayed and must not get worse.
 
     Raises:
         MissingExtraError: torch is not installed.
@@ -244,7 +246,8 @@ def improve(
     folder = local_folder(output)
     settings = settings or ImproveSettings()
     settings = replace(settings, sequence=_found([*recordings, *held_out], settings.sequence, folder, "improve"))
-    result = run_rounds(recordings, folder, settings, rounds, held_out, workers)
+    before = local_folder(after) if after is not None else None
+    result = run_rounds(recordings, folder, settings, rounds, held_out, workers, after=before)
     publish(folder)
     return result
 

@@ -118,6 +118,9 @@ def _table(found: CameraFromMotion) -> str:
     ]
     lines += [f"  {name:<3} {value:12.6g}  +- {found.deviations[name]:.2g}" for name, value in found.values.items()]
     lines.append(f"  focal length +- {100 * found.focal_deviation:.2g} %")
+    read = f"{1000 * found.readout:.1f} ms +- {1000 * found.readout_deviation:.2g}"
+    rolling = abs(found.readout) > 3 * found.readout_deviation + 0.002
+    lines.append(f"  read-out of a picture {read}: " + ("a rolling shutter" if rolling else "no rolling shutter seen"))
     return "\n".join(lines)
 
 

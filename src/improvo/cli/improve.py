@@ -52,6 +52,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SEQUENCE",
         help="held out for validation (default: one sequence in five, or the last fifth of a single one)",
     )
+    parser.add_argument(
+        "--after",
+        type=Path,
+        metavar="FOLDER",
+        help="finished OUT of an earlier run: starts from its weights; recordings that it had are replayed and must "
+        "not get worse, the others are new",
+    )
     add_job_arguments(parser)
     add_data_card(parser)
     add_setting(
@@ -129,6 +136,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.ray,
         data,
         ImprovementProgress(say, shown=not output.as_json()),
+        after=arguments.after,
     )
     kept = result.candidates[result.best].name
     figures({"weights": str(result.weights), "best": result.best, "kept": kept}, "")

@@ -58,7 +58,8 @@ class AttachedDetector:
     @property
     def cells(self) -> Mask:
         """(C,) cells of the picture, row by row, that show something attached to the camera."""
-        return (self._against >= _ENOUGH) & (self._against > self._for)
+        against, world = _with_neighbours(self._against), _with_neighbours(self._for)
+        return (against >= _ENOUGH) & (against > world)
 
     def observe(self, view: View) -> bool:
         """Mark the keypoints of the newest view.
@@ -130,3 +131,10 @@ class AttachedDetector:
     def _counted(self, cells: Int64) -> Float64:
         """Matches in each cell (C,); a single comparison may not decide about one."""
         return np.minimum(np.bincount(cells, minlength=_ROWS * _COLUMNS), _MOST).astype(np.float64)
+
+
+def _with_neighbours(evidence: Float64) -> Float64:
+    """Evidence (C,) of each cell and a quarter of what the four cells beside it have: few things are one cell large."""
+    grid = np.pad(evidence.reshape(_ROWS, _COLUMNS), 1)
+    beside = grid[:-2, 1:-1] + grid[2:, 1:-1] + grid[1:-1, :-2] + grid[1:-1, 2:]
+    return np.asarray(grid[1:-1, 1:-1] + 0.25 * beside).ravel()

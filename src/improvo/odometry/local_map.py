@@ -11,6 +11,7 @@ from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.geometry.ransac import Ransac, absolute_pose
 from improvo.geometry.triangulation import triangulate_tracks
+from improvo.odometry.keypoint_refinement import KeypointRefiner
 from improvo.odometry.projection_search import match_by_projection
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_points, ransac_rows
@@ -35,6 +36,7 @@ class LocalMap:
         self.history: deque[View] = deque(maxlen=settings.matching.search_frames)  # in order of processing
         self._settings = settings
         self._descriptor_distance = descriptor_distance
+        self.refiner = KeypointRefiner(camera, settings.refinement, settings.matching.search_frames)
         self._search_radius = max(3.0, settings.matching.search_radius * camera.width / 640.0)
 
     def remember(self, view: View) -> None:
@@ -67,6 +69,8 @@ class LocalMap:
                 view.points[:] = NO_POINT
                 return inliers, share
         self._search_by_projection(view)
+        self.refiner.update_poses(self.history)
+        self.refiner.refine([view], self.store)
         return inliers, share
 
     def _is_lost(self, inliers: int, share: float) -> bool:
@@ -193,4 +197,7 @@ class LocalMap:
         for i, v in enumerate(views):
             of_view = (camera == i) & (point >= 0)
             v.points[row[of_view]] = point[of_view]
+        made = np.zeros(self.store.count, bool)
+        made[ids[good]] = True
+        self.refiner.refine(sorted(views, key=lambda each: each.frame_index), self.store, made)
         return int(good.sum())

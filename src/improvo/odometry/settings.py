@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from improvo.backend.settings import ObjectiveSettings, SolverSettings
 from improvo.errors import ConfigError
@@ -101,6 +102,8 @@ class VerdictSettings:
     # simulated and real recordings with truth (docs/odometry.md).
     scale_share: float = 40.0
     max_error: float = 5.0  # % of the path; a larger estimated error makes a segment doubtful
+    max_focal_change: float = 0.12  # of the logarithm of the focal length, within a window or from one to the next
+    max_focal_error: float = 0.2  # of the logarithm of the focal length, from that of the camera as given
     max_scale_error: float = 0.1  # of the logarithm of the scale between two windows; more is an uncertain stretch
 
     def __post_init__(self) -> None:
@@ -149,6 +152,26 @@ class RansacGateSettings:
 
 
 @dataclass(frozen=True)
+class RefinementSettings:
+    """When a keypoint goes to where its map point's patch lies (see `improvo.odometry.keypoint_refinement`)."""
+
+    frontends: Literal["networks", "all", "none"] = "networks"  # classical keypoints are as exact without it
+    max_start: float = 3.0  # pixels between keypoint and projection; a search begins at the projection only within
+    max_move: float = 2.0  # pixels from the detected keypoint; one that would go farther stays
+    min_correlation: float = 0.8  # of the grey values of both patches
+    max_deviation: float = 0.3  # pixels, expected error of the new place
+    max_area_ratio: float = 2.5  # between two pictures; beyond it the patch is taken anew from the newer one
+
+    def __post_init__(self) -> None:
+        if self.frontends not in ("networks", "all", "none"):
+            raise ConfigError(f"refinement.frontends={self.frontends!r}: choose `networks`, `all` or `none`")
+        if min(self.max_start, self.max_move, self.max_deviation) <= 0:
+            raise ConfigError("refinement: max_start, max_move and max_deviation are pixels and must be positive")
+        if not self.max_area_ratio > 1:
+            raise ConfigError(f"refinement.max_area_ratio={self.max_area_ratio}: must be over 1")
+
+
+@dataclass(frozen=True)
 class OdometrySettings:
     """Settings of `VisualOdometry`."""
 
@@ -160,6 +183,7 @@ class OdometrySettings:
     window: WindowSettings = field(default_factory=WindowSettings)
     loss: TrackingLossSettings = field(default_factory=TrackingLossSettings)
     health: HealthSettings = field(default_factory=HealthSettings)
+    refinement: RefinementSettings = field(default_factory=RefinementSettings)
     verdict: VerdictSettings = field(default_factory=VerdictSettings)
     bridging: BridgingSettings = field(default_factory=BridgingSettings)
     attached: AttachedSettings = field(default_factory=AttachedSettings)

@@ -93,6 +93,8 @@ class SlidingWindow:
                 final.extend(_with_non_keyframes(keyframe))
                 keyframe.final, keyframe.non_keyframes = True, []
         del self._keyframes[: -(self._settings.keyframes + self._settings.fixed)]
+        for view, _ in final:
+            view.image = None
         return final
 
     def remaining(self) -> Iterator[tuple[View, Float64]]:

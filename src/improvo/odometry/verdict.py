@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from improvo.odometry.evidence import HALVES, PARTS, QUARTERS, Spread
 from improvo.odometry.settings import VerdictSettings
 from improvo.types import Float64
 
+_SIGMAS = 5.0  # standard errors that a deviation of the focal length must exceed
+_LARGEST_LENS_ERROR = 0.06  # of the logarithm of a focal length; a window that knows it less well says nothing of it
 RIGHT, DOUBTFUL, NOT_JUDGED = "right", "doubtful", "not judged"
 
 
@@ -53,6 +56,7 @@ def judge(spread: Spread | None, settings: VerdictSettings, alarms: tuple[str, .
     """
     if spread is None:
         return Verdict(DOUBTFUL if alarms else NOT_JUDGED, evidence=(*alarms, "too few keyframes to judge the path"))
+    alarms = (*alarms, *_lens_alarms(spread, settings))
     error = estimated_error(spread, settings)
     uncertain = _uncertain(spread, settings)
     evidence = [*alarms, _in_words(spread, error, settings)]
@@ -94,6 +98,33 @@ def _scale_errors(spread: Spread) -> Float64:
     return np.asarray(np.sqrt((spread.scale_steps**2).mean(axis=1)), np.float64)
 
 
+def _lens_alarms(spread: Spread, settings: VerdictSettings) -> tuple[str, ...]:
+    """What contradicts that one lens, the camera's, looked at one world that stands still; most telling first.
+
+    A focal length that is not the camera's can be a zoom or a wrong calibration. Where something large moves, too, its
+    motion and the camera's fit together only with a focal length that is wrong and changes.
+    """
+    alarms: list[str] = []
+    sure = [each for each in spread.lens if each.offset_error < _LARGEST_LENS_ERROR]
+    for each in spread.lens:
+        first, last = each.frames
+        if abs(each.growth) > max(settings.max_focal_change, _SIGMAS * each.growth_error):
+            alarms.append(_told(first, last, f"changes by {100 * abs(np.expm1(each.growth)):.0f} %"))
+    for each in sure:
+        first, last = each.frames
+        if abs(each.offset) > max(settings.max_focal_error, _SIGMAS * each.offset_error):
+            alarms.append(_told(first, last, f"is {np.exp(each.offset):.2f} times that of the camera as given"))
+    for a, b in pairwise(sure):
+        change = b.offset - a.offset
+        if abs(change) > max(settings.max_focal_change, _SIGMAS * float(np.hypot(a.offset_error, b.offset_error))):
+            alarms.append(_told(a.frames[0], b.frames[1], f"changes by {100 * abs(np.expm1(change)):.0f} %"))
+    return tuple(alarms[:1])
+
+
+def _told(first: int, last: int, words: str) -> str:
+    return f"frames {first} to {last} fit best if the focal length {words}: a zoom, a wrong calibration, or a mover"
+
+
 def _uncertain(spread: Spread, settings: VerdictSettings) -> tuple[tuple[int, int], ...]:
     """Stretches (first and last frame) across which the parts of the evidence disagree about the scale."""
     found: list[tuple[int, int]] = []
@@ -115,7 +146,7 @@ def _in_words(spread: Spread, error: float, settings: VerdictSettings) -> str:
         first, last = spread.link_frames[int(np.argmax(_scale_errors(spread)))].tolist()
         return words + f"the scale between frames {first} and {last} is known to {100 * scale:.0f} % only"
     if quarters[worst] > 2.0 * halves.max():
-        return words + f"{PARTS[worst]} quarter of the picture it would be another ({quarters[worst]:.1f} %)"
+        return words + f"{PARTS[worst]} quarter of the picture it differs by {quarters[worst]:.1f} %"
     return words + f"{HALVES[int(np.argmax(halves))]} alone differs by {halves.max():.1f} %"
 
 

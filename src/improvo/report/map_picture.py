@@ -13,11 +13,12 @@ from improvo.files import written_atomically
 from improvo.odometry.run_folder import RunFolder
 from improvo.report.overhead import overhead_axes, robust_limits
 from improvo.report.palettes import PALETTES, Palette
-from improvo.types import SparseMap
+from improvo.types import SparseMap, UInt8
 
 _BACKGROUND = "#565b63"  # neither the paper's black (last window) nor its white (points)
 _DOUBTED = "#ff4fd8"  # a band under the path, which no ramp of the palettes has
 LAST_POSES = 30  # N_last
+_DARKEST = 70  # grey level in which black points are drawn
 
 
 def draw_map(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"], last_poses: int = LAST_POSES) -> None:
@@ -33,7 +34,7 @@ def draw_map(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"], l
 
 
 def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: int = LAST_POSES) -> bytes:
-    """A PNG: points white, the trajectory from blue to red over time, the last window black.
+    """A PNG: points in their own colours, the trajectory from blue to red over time, the last window black.
 
     Raises:
         InputError: no frame of the run has a pose.
@@ -61,7 +62,7 @@ def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: in
         points_2d[inside, 0],
         points_2d[inside, 1],
         s=size,
-        c="white",
+        c=map_colours(run.map)[shown][inside] / 255.0,
         alpha=alpha,
         linewidths=0,
         zorder=1,
@@ -111,6 +112,13 @@ def trusted_points(sparse_map: SparseMap) -> NDArray[np.intp]:
     """Rows of the good points: at least three observations, and a mean error below 2 pixels."""
     good = (sparse_map.observations >= 3) & (sparse_map.mean_error < 2.0) & np.isfinite(sparse_map.xyz).all(axis=1)
     return np.flatnonzero(good)
+
+
+def map_colours(sparse_map: SparseMap) -> UInt8:
+    """RGB (P, 3) of the points as the recording shows them, not so dark that they are lost; white where not known."""
+    if sparse_map.rgb is None:
+        return np.full((len(sparse_map), 3), 235, np.uint8)
+    return np.rint(_DARKEST + (255 - _DARKEST) / 255.0 * sparse_map.rgb).astype(np.uint8)
 
 
 def _title(run: RunFolder, points: int, outside: int) -> str:

@@ -31,8 +31,8 @@ _SCENE = """
 pink: doubtful; yellow: the frame below</span></div>
 <canvas class="scene" id="scene" tabindex="0" aria-label="3D map: drag to turn, shift-drag to move, wheel to zoom">
 </canvas>
-<p class="note only-screen">Drag turns, shift or right button moves, wheel or two fingers zoom; arrow keys and + - too.
-</p>"""
+<p class="note only-screen">Drag turns, shift or right button moves, the wheel zooms after a click on the map, two
+fingers zoom and move; arrow keys and + - too. One finger up or down scrolls the page.</p>"""
 
 _FRAMES = """
 <div class="controls only-screen"><button type="button" id="frame-play">Play</button>
@@ -117,8 +117,8 @@ def _map_section(page: Page, run: RunFolder, palette: Palette) -> None:
     colours = "from blue to red" if palette.name == "paper" else "from dark to bright"
     page.picture(
         map_png(run, palette),
-        f"Seen from above: points white, the trajectory {colours} over time, the last window black, a pink band under "
-        "what is doubtful.",
+        f"Seen from above: points as the recording shows them, the trajectory {colours} over time, the last window "
+        "black, a pink band under what is doubtful.",
     )
 
 

@@ -77,7 +77,7 @@ def with_camera_note(run: Run, camera_file: str | None) -> Run:
     if side is None or not side.is_file():
         return run
     found = read_json_file(side, "delete it")
-    report = {**run.report, "camera": {**run.report["camera"], "from_motion": found.get("found")}}
+    report = {**run.report, "camera_from_motion": found.get("found")}
     write_json(run.folder / "run.json", report)
     return replace(run, report=report)
 

@@ -51,6 +51,8 @@ class CameraFromMotion:
     points: int
     observations: int
     fov: float  # degrees, horizontally
+    readout: float  # seconds between the first and the last row of a picture: 0 unless the shutter is rolling
+    readout_deviation: float  # seconds
 
     @property
     def focal_deviation(self) -> float:
@@ -67,7 +69,8 @@ class CameraFromMotion:
     @property
     def figures(self) -> dict[str, Any]:
         """Everything as plain JSON."""
-        names = ("deviations", "rms", "fov", "frames", "tracked", "views", "points", "observations")
+        names = ["deviations", "readout", "readout_deviation", "rms", "fov", "frames", "tracked", "views", "points"]
+        names.append("observations")
         camera = {"width": self.camera.width, "height": self.camera.height, "model": self.camera.distortion_model}
         return {**camera, "values": self.values, **{name: getattr(self, name) for name in names}}
 
@@ -127,8 +130,8 @@ def camera_from_motion(
     lens = found.adjusted.scene.lens
     scale = size[0] / lens.width
     camera = lens.camera.resized(*size)
-    deviations = np.sqrt(np.diag(found.adjusted.covariance)) * (scale, scale, scale, scale, 1.0, 1.0)
-    scene = found.adjusted.scene
+    spread, scene = np.sqrt(np.diag(found.adjusted.covariance)), found.adjusted.scene
+    deviations = spread[:6] * (scale, scale, scale, scale, 1.0, 1.0)
     result = CameraFromMotion(
         camera=camera,
         deviations=dict(zip(NAMES, deviations.tolist(), strict=True)),
@@ -139,6 +142,8 @@ def camera_from_motion(
         points=len(scene.xyz),
         observations=len(scene.view),
         fov=lens.fov,
+        readout=scene.readout,
+        readout_deviation=float(spread[6]),
     )
     refuse_unsure(result, name, settings)
     return result

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
@@ -86,6 +87,7 @@ def scene_of(pieces: list[TrackedPiece], lens: Lens, max_views: int) -> tuple[Sc
         for rows in chosen
     ]
     poses: list[Float64] = []
+    motions: list[Float64] = []
     views: list[SceneView] = []
     xyz, view_of, point_of, pixels = [], [], [], []
     points_before = 0
@@ -102,6 +104,7 @@ def scene_of(pieces: list[TrackedPiece], lens: Lens, max_views: int) -> tuple[Sc
             point_of.append(points_before + place)
             pixels.append(piece.pixels[row][seen])
             poses.append(se3.inverse(view.world_from_cam))
+            motions.append(_motion(piece.views, row))
             world = _WORLDS * number + view.segment
             views.append(SceneView(piece.pixels[row], piece.descriptors[row], piece.max_distance, world))
         xyz.append(piece.map.xyz[order])
@@ -116,8 +119,26 @@ def scene_of(pieces: list[TrackedPiece], lens: Lens, max_views: int) -> tuple[Sc
         view[order].astype(np.int64),
         point[order].astype(np.int64),
         np.concatenate(pixels)[order],
+        np.array([view.world for view in views]),
+        np.array(motions),
     )
     return scene.without(np.zeros(len(view), bool)), views
+
+
+def _motion(views: list[FinalView], row: int) -> Float64:
+    """(6,) how points move in the frame of a view's camera: shift and turn a second, from the views before and after.
+
+    Zero where the view has no neighbour in its segment.
+    """
+    near = [views[place] for place in (row - 1, row, row + 1) if 0 <= place < len(views)]
+    near = [view for view in near if view.segment == views[row].segment]
+    first, last = near[0], near[-1]
+    seconds = last.time - first.time
+    if seconds <= 0:
+        return np.zeros(6)
+    last_from_first = se3.inverse(last.world_from_cam) @ first.world_from_cam
+    turn = Rotation.from_matrix(last_from_first[:3, :3]).as_rotvec()
+    return np.concatenate([last_from_first[:3, 3], turn]) / seconds
 
 
 def _different_views(piece: TrackedPiece, width: int) -> Int64:

@@ -16,8 +16,8 @@ from improvo.training.distributed import Process
 from improvo.training.held_settings import HeldSettings
 from improvo.training.labels import DUSTBIN
 from improvo.training.photometric_batch import augment_batch
-from improvo.training.picture_store import PictureStore, on_device
-from improvo.training.pictures import Pictures
+from improvo.training.picture_store import MaskStore, PictureStore, on_device
+from improvo.training.pictures import Pictures, Source
 from improvo.training.posed import PosedSequence, overlapping_pairs
 from improvo.training.posed_frames import PosedFrames
 from improvo.training.random_views import random_views
@@ -70,9 +70,11 @@ class DevicePairs:
         frames = [picture for sequence in posed for picture in sequence.pictures]
         singles = [picture for source in pictures.sources for picture in source.pictures]
         self.store = PictureStore([*frames, *singles], device)
+        self.masks = _mask_store([*posed, *pictures.sources], self.store, device)
         self.frames = PosedFrames(posed, device)
         self.first_picture = len(frames) + np.cumsum([0, *(len(source.pictures) for source in pictures.sources)])
         self.pairs = [overlapping_pairs(sequence, settings.pairs) for sequence in posed]
+        self.weights = np.array([sequence.weight for sequence in posed])
         self.useful = [row for row, pairs in enumerate(self.pairs) if pairs is not None]
         self.process = Process.current()
 
@@ -112,8 +114,7 @@ class DevicePairs:
         rows, scenes = np.zeros((count, 2), np.int64), np.zeros(count, np.int64)
         b_from_a = np.tile(np.eye(3), (count, 1, 1))
         centres = np.full((2, count, 2), np.nan)
-        turns = -(-posed // max(len(self.useful), 1))  # every sequence once before any comes again
-        order = [int(scene) for _ in range(turns) for scene in rng.permutation(self.useful)]
+        order = self._scenes(rng, posed)
         for pair in range(count):
             if pair < posed:
                 scene = scenes[pair] = order[pair]
@@ -131,6 +132,14 @@ class DevicePairs:
         self._look_there(H_a, b_from_a, rows, sizes, centres[1], related)
         H_b = random_views(rng, self.settings.views, sizes[:, 1], centres[1])
         return _Plan(rows, scenes, b_from_a, np.concatenate([H_a, H_b]), related)
+
+    def _scenes(self, rng: np.random.Generator, count: int) -> list[int]:
+        """Which sequences the pairs are of: every one once before any comes again, or, of different weights, drawn."""
+        weights = self.weights[self.useful]
+        if count and (weights != weights[0]).any():
+            return [int(scene) for scene in rng.choice(self.useful, count, p=weights / weights.sum())]
+        turns = -(-count // max(len(self.useful), 1))
+        return [int(scene) for _ in range(turns) for scene in rng.permutation(self.useful)]
 
     def _picture_pair(self, rng: np.random.Generator) -> tuple[int, int, int, Float64]:
         """Source, two of its pictures, and the homography between them; mostly one picture twice."""
@@ -199,6 +208,8 @@ class DevicePairs:
             visible[: plan.posed] = self.frames.shown(rows, carried, self.settings.pairs.depth_tolerance)
         sizes = on_device(self.store.sizes[plan.rows].astype(np.float32), points.device)
         visible = visible & _within(in_a, sizes[:, 0]) & _within(in_b, sizes[:, 1])
+        if self.masks is not None:
+            visible = visible & self.masks.used(plan.rows[:, 0], in_a) & self.masks.used(plan.rows[:, 1], in_b)
         result = _warped(plan.view_from_picture[count:], torch.where(visible[..., None], in_b, 0.0))
         return result, visible & _within(
             result, on_device(np.array([[views.width, views.height]], np.float32), points.device)
@@ -217,6 +228,14 @@ class DevicePairs:
         kept = kept & _within(moved, size)
         points_b = torch.cat([torch.where(kept[..., None], moved, 0.0), points_b[posed:]])
         return points_b, torch.cat([kept, valid[posed:]])
+
+
+def _mask_store(runs: Sequence[PosedSequence | Source], store: PictureStore, device: torch.device) -> MaskStore | None:
+    """Of all pictures; None where none has a mask."""
+    if not any(run.masks for run in runs):
+        return None
+    masks = [mask for run in runs for mask in (run.masks or (None,) * len(run.pictures))]
+    return MaskStore(masks, store.sizes[: store.count], device)
 
 
 def _warped(H: Float64, points: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from improvo.types import Float32, Float64, Int64, UInt8
+from improvo.types import Float32, Float64, Int64, Mask, UInt8
 
 _REDUCED_ABOVE = 1.5  # pixels of the picture per pixel of the view from which on the halved picture is looked at
 
@@ -110,6 +110,28 @@ class PictureStore:
         return start, on_device(self.sizes[rows], device)[..., None]
 
 
+class MaskStore:
+    """Which places of pictures are used, on a device; masks are kept at a quarter of their size.
+
+    Args:
+        masks: (H, W) each, which pixels are used; None where all are.
+        sizes: (N, 2) width, height of the pictures.
+    """
+
+    def __init__(self, masks: Sequence[Mask | None], sizes: Int64, device: torch.device) -> None:
+        everywhere = np.ones((2, 2), np.float32)
+        maps = [everywhere if mask is None else _quartered(mask) for mask in masks]
+        scales = [(w / m.shape[1], h / m.shape[0]) for (w, h), m in zip(sizes.tolist(), maps, strict=True)]
+        self._maps = DepthStore(maps, np.array(scales).reshape(-1, 2), device)
+
+    def used(self, rows: Int64, points: Tensor) -> Tensor:
+        """(V, N) bool, whether places (V, N, 2) of pictures lie on used pixels alone; places near the edge do too."""
+        size = on_device(self._maps.sizes[rows] - 1, points.device)[:, None]
+        scale = on_device(self._maps.scales[rows], points.device)[:, None]
+        middles = torch.minimum(((points + 0.5) / scale - 0.5).clamp(min=0), size.float())
+        return self._maps.sample(rows, (middles + 0.5) * scale - 0.5) > 0
+
+
 class DepthStore:
     """Inverse depth maps on a device; 0 where nothing is known.
 
@@ -151,6 +173,12 @@ def on_device(values: NDArray[Any], device: torch.device) -> Tensor:
     """A small array as float32, or int64 where it holds whole numbers, without waiting for what the device does."""
     kind = np.int64 if np.issubdtype(values.dtype, np.integer) else np.float32
     return torch.from_numpy(np.ascontiguousarray(values, kind)).to(device, non_blocking=True)
+
+
+def _quartered(mask: Mask) -> Float32:
+    height, width = mask.shape
+    small = cv2.resize(mask.astype(np.uint8) * 255, (-(-width // 4), -(-height // 4)), interpolation=cv2.INTER_AREA)
+    return (small == 255).astype(np.float32)
 
 
 def _starts(sizes: Int64) -> Int64:

@@ -143,6 +143,7 @@
 
   const fingers = new Map();
   canvas.addEventListener("pointerdown", (event) => {
+    canvas.focus({ preventScroll: true });
     canvas.setPointerCapture(event.pointerId);
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
   });
@@ -163,6 +164,7 @@
     canvas.addEventListener(kind, (event) => fingers.delete(event.pointerId));
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("wheel", (event) => {
+    if (document.activeElement !== canvas) return; // the page scrolls until the map is clicked
     event.preventDefault();
     zoom(Math.exp(0.0012 * event.deltaY));
   }, { passive: false });
