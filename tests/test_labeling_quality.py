@@ -135,3 +135,11 @@ def test_parts_are_assessed_like_the_whole(tmp_path: Path) -> None:
     assert 0 < doubtful.sum() < 40
     late = [len(part.frame) for part in read_observations(file, range(50, FRAMES))]
     assert sum(late) == (tracks.frame >= 50).sum()
+
+
+def test_frames_of_a_segment_that_the_odometry_doubts_are_not_trusted() -> None:
+    nothing = np.full(FRAMES, np.nan)
+    has_pose, doubtful = np.ones(FRAMES, bool), np.arange(FRAMES) >= 30
+    quality = gate.assess_frames(nothing, nothing, has_pose, np.zeros(0, int), LabelSettings(), None, doubtful)
+    assert np.flatnonzero(~quality.trusted).tolist() == list(range(30, FRAMES))
+    assert quality.counts()["doubtful"] == FRAMES - 30

@@ -50,10 +50,8 @@ def holder(tmp_path: Path) -> subprocess.Popen[str]:
 
 
 def test_a_second_process_is_told_who_is_at_work(tmp_path: Path, holder: subprocess.Popen[str]) -> None:
-    with (
-        pytest.raises(OutputError, match=rf"process {holder.pid} on .* \(since 2.* is at work there"),
-        locked(tmp_path),
-    ):
+    who = rf"process {holder.pid} on .* \(since 2.* is at work there"
+    with pytest.raises(OutputError, match=who), locked(tmp_path):
         pass
 
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from improvo import locations
 from improvo.errors import InputError, OutputError
+from improvo.formats import FORMAT, FORMAT_KEY, check_format
 from improvo.untrusted.paths import check_path
 from improvo.untrusted.text import load_json
 
@@ -147,7 +148,7 @@ def check_output_folder(path: Path, command: str) -> None:
     """Refuse a folder that `command` did not make, before any work is done.
 
     Raises:
-        OutputError: the path is a file, a folder with other content, or cannot be written.
+        OutputError: the path is a file, a folder with other content or of a later improvo, or cannot be written.
     """
     try:
         check_path(path)
@@ -155,6 +156,10 @@ def check_output_folder(path: Path, command: str) -> None:
         raise OutputError(str(error)) from None
     if path.exists() and not path.is_dir():
         raise OutputError(f"{path}: is a file, not a folder; choose another output folder")
+    try:
+        check_folder_format(path)
+    except InputError as error:
+        raise OutputError(str(error)) from None
     if path.is_dir() and any(not _is_temporary(entry) for entry in path.iterdir()):
         owner = _owner(path)
         if owner != command:
@@ -172,7 +177,7 @@ def make_output_folder(path: Path, command: str) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{path}: cannot be created ({error.strerror}); choose another output folder") from None
-    write_json(path / MARKER, {"made_by": command})
+    write_json(path / MARKER, {"made_by": command, FORMAT_KEY: FORMAT})
     clear_leftovers(path)
 
 
@@ -181,13 +186,28 @@ def _is_temporary(path: Path) -> bool:
     return path.name.startswith(".") and ".partial" in path.suffixes
 
 
+def check_folder_format(path: Path) -> None:
+    """Refuse a folder that a later improvo made.
+
+    Raises:
+        InputError: see `formats.check_format`.
+    """
+    check_format(_marker(path).get(FORMAT_KEY), path)
+
+
 def _owner(path: Path) -> str | None:
     """The command that made a folder; None where no marker says so."""
+    owner = _marker(path).get("made_by")
+    return owner if isinstance(owner, str) else None
+
+
+def _marker(path: Path) -> dict[str, Any]:
+    """What the marker of a folder says; empty where there is none."""
     for name in (MARKER, f".{FORMER_NAME}.json"):
         try:
             marker = load_json((path / name).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             continue
-        if isinstance(marker, dict) and isinstance(marker.get("made_by"), str):
-            return str(marker["made_by"])
-    return None
+        if isinstance(marker, dict):
+            return marker
+    return {}

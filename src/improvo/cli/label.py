@@ -8,9 +8,9 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.flags import add_setting
 from improvo.cli.options import (
     add_config_arguments,
@@ -18,12 +18,14 @@ from improvo.cli.options import (
     add_sequence_arguments,
     check_recordings,
     folder_path,
+    recording_path,
     settings_from,
 )
 from improvo.cli.output import figures, next_step, notice, say
 from improvo.cli.plan import duration, say_label_plan
 from improvo.errors import ConfigError
 from improvo.odometry.run_settings import LabelRunSettings
+from improvo.terminal import counted
 
 if TYPE_CHECKING:
     from improvo.labeling.store import SequenceRecord
@@ -33,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `improvo label`."""
     defaults = LabelRunSettings()
     parser.add_argument(
-        "sequences", type=Path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
+        "sequences", type=recording_path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
     )
     parser.add_argument("-o", "--output", type=folder_path, metavar="LABELS", help="folder of the label store")
     parser.add_argument(
@@ -77,6 +79,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Label what is not labelled yet; 0 unless nothing could be."""
     settings = settings_from(LabelRunSettings, arguments)
     check_recordings(arguments.sequences)
+    from improvo.frontend.registry import check_frontend
+
+    check_frontend(settings.frontend.name, settings.frontend.network)
     if arguments.plan:
         return _plan(arguments, settings)
     if arguments.output is None:
@@ -86,6 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
     from improvo.odometry.compile import compile_odometry
     from improvo.terminal import progress
 
+    settings = with_found_camera(settings, arguments.sequences, arguments.output, "label")
     compile_odometry(notice)
     total = len(arguments.sequences)
     finished = done_here = 0
@@ -145,7 +151,7 @@ def _line(record: SequenceRecord) -> str:
 
     if record.state != DONE:
         return f"{record.name}: not labelled: {record.reason}"
-    poses = f"{record.tracked} of {record.frames} frames with a pose"
+    poses = f"{record.tracked} of {counted(record.frames, 'frame')} with a pose"
     labels = f"{record.stable} stable, {record.unstable} unstable, {record.ignore} ignored tracks"
     withheld = f", {record.withheld} withheld" if record.withheld else ""
     return f"{record.name}: {poses}; {labels}{withheld}" + (f"; frames: {record.notes}" if record.notes else "")

@@ -35,19 +35,24 @@ _SEQUENCE_OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 
-def add_sequence_arguments(parser: argparse.ArgumentParser, defaults: SequenceSettings | None = None) -> None:
-    """How the sequence is read; read back by `settings_from`."""
+def add_sequence_arguments(
+    parser: argparse.ArgumentParser, defaults: SequenceSettings | None = None, without: tuple[str, ...] = ()
+) -> None:
+    """How the sequence is read, all but the options `without`; read back by `settings_from`."""
     group = parser.add_argument_group("how the sequence is read")
     defaults = defaults or SequenceSettings()
     for name, options in _SEQUENCE_OPTIONS.items():
+        if name in without:
+            continue
         add_setting(group, defaults, f"--{name.replace('_', '-')}", name, section="sequence.", **options)
 
 
-def add_frontend_arguments(parser: argparse.ArgumentParser, defaults: Any) -> None:
+def add_frontend_arguments(parser: argparse.ArgumentParser, defaults: Any, seed: str = "odometry.seed") -> None:
     """Which frontend, how many keypoints, how a network runs, and the seed.
 
     Args:
-        defaults: settings with the sections `frontend` and `odometry`.
+        defaults: settings with the section `frontend`.
+        seed: the setting that `--seed` stands for.
     """
     add_setting(parser, defaults, "--frontend", "frontend.name", metavar="NAME")
     add_setting(parser, defaults, "--max-keypoints", "frontend.max_keypoints")
@@ -57,7 +62,7 @@ def add_frontend_arguments(parser: argparse.ArgumentParser, defaults: Any) -> No
     )
     add_setting(parser, defaults, "--device", f"{network}.device", help="of a network; cuda needs the extra `train`")
     add_setting(parser, defaults, "--precision", f"{network}.precision", help="of a network")
-    add_setting(parser, defaults, "--seed", "odometry.seed", help="of all random choices")
+    add_setting(parser, defaults, "--seed", seed, help="of all random choices")
 
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:

@@ -35,10 +35,16 @@ class Estimate:
     @property
     def words(self) -> str:
         """For a person."""
+        minutes = max(self.minutes, 1)
+        time = f"{minutes:.0f} minutes" if minutes < 100 else f"{minutes / 60:.1f} hours"
         return (
-            f"about {max(self.minutes, 1):.0f} minutes on two calm cores, {self.memory_mib / 1024:.1f} GiB of memory "
-            f"and {self.disk_mib:.0f} MiB of disk; {self.steps} steps of training a round"
+            f"about {time} on two calm cores, {self.memory_mib / 1024:.1f} GiB of memory "
+            f"and {_size(self.disk_mib)} of disk; {self.steps} steps of training a round"
         )
+
+
+def _size(mib: float) -> str:
+    return f"{mib:.0f} MiB" if mib < 1000 else f"{mib / 1024:.1f} GiB"
 
 
 def estimate(

@@ -78,6 +78,7 @@ class ImproveFolder:
         evaluate: as given by the user.
         settings: of the loop.
         start: weights file that it starts from.
+        after: finished folder of the loop that this one follows; may be none.
 
     Raises:
         OutputError: the folder is not ours, or cannot be written.
@@ -85,7 +86,13 @@ class ImproveFolder:
     """
 
     def __init__(
-        self, folder: Path, sequences: Sequence[Path], evaluate: Sequence[Path], settings: ImproveSettings, start: Path
+        self,
+        folder: Path,
+        sequences: Sequence[Path],
+        evaluate: Sequence[Path],
+        settings: ImproveSettings,
+        start: Path,
+        after: Path | None = None,
     ) -> None:
         check_output_folder(folder, COMMAND)
         self.folder = folder
@@ -93,6 +100,8 @@ class ImproveFolder:
         values["frontend"]["name"] = f"sha256:{hashlib.sha256(start.read_bytes()).hexdigest()}"
         values["sequences"] = [str(path.resolve()) for path in sequences]
         values["evaluate"] = [str(path.resolve()) for path in evaluate]
+        if after is not None:
+            values["after"] = str(after.resolve())
         self._begin(values)
 
     @property

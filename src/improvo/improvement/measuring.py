@@ -63,15 +63,15 @@ def validate(
     started = time.perf_counter()
     jobs = [_ScoreJob(one, candidate.weights, settings) for one in reference]
     scores = [entry for found in crew.results(_scores_of, jobs, tick) for entry in found]
-    if not scores:
+    if all(entry.earlier for entry in scores):
         raise InputError(
             "what is held back has no pair of frames with poses and depth; hold back a longer or livelier recording "
             "with --evaluate, or more of this one with --set split.share=0.3"
         )
     labelled = read_labels(candidate.held_back) if any(record.state == DONE for record in records) else []
-    gaps = tuple(sorted({entry.gap for entry in scores}))
+    gaps = tuple(sorted({entry.gap for entry in scores if not entry.earlier}))
     validation = Validation(
-        frames=sum(len(one.frames) for one in reference),
+        frames=sum(len(one.frames) for one in reference if not one.earlier),
         tracked=sum(record.tracked for record in records),
         segments=sum(record.segments for record in records),
         labels={name: sum(getattr(record, name) for record in records) for name in ("stable", "unstable", "ignore")},
@@ -131,11 +131,8 @@ def _scores(
         scores = score_pairs(run, features, pairs, settings.matches, tick)
         seconds = float(np.median(times[pairs[:, 1]] - times[pairs[:, 0]]))
         values = {name: [round(float(value), 6) for value in each] for name, each in scores.values.items()}
-        found.append(
-            GapScores(
-                reference.name, level, scores.gap, round(seconds, 3), pairs.tolist(), scores.matches.tolist(), values
-            )
-        )
+        where = reference.name, level, scores.gap, round(seconds, 3)
+        found.append(GapScores(*where, pairs.tolist(), scores.matches.tolist(), values, reference.earlier))
     return found
 
 
@@ -175,8 +172,8 @@ def _truth(
         if not usable:
             continue
         protocol = PoseSettings(
-            usable, matches.pairs, matches.max_keypoints, seed=matches.seed, shuffles=matches.shuffles,
-            right_px=matches.right_px,
+            gaps=usable, pairs=matches.pairs, max_keypoints=matches.max_keypoints, seed=matches.seed,
+            shuffles=matches.shuffles, right_px=matches.right_px,
         )  # fmt: skip
         run = run_pose_protocol(
             [Recorded(str(path), part.sequence)], [frontend], protocol, candidate.folder / "features" / str(number),

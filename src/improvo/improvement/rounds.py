@@ -14,8 +14,6 @@ import numpy as np
 
 from improvo.errors import ConfigError, InputError, OutputError
 from improvo.frontend.weights import find_weights, load_weights, save_weights
-from improvo.geometry.camera import Camera
-from improvo.improvement.estimate import Estimate, estimate
 from improvo.improvement.folder import Candidate, ImproveFolder
 from improvo.improvement.measuring import pairs_of, validate
 from improvo.improvement.progress import ImprovementProgress
@@ -110,14 +108,6 @@ class Rounds:
             else:
                 write_calibrated(weights_file, candidate.weights, calibration_images(part, self._images))
         return candidate
-
-    def estimate(self, start: Candidate, split: Split, rounds: int) -> Estimate:
-        """Roughly what all of it takes; nothing of what is done already is taken off."""
-        parts = split.training, split.held_back
-        training, held_back = (sum(_length(path, part.sequence) for path in part.paths) for part in parts)
-        camera = _camera(parts[0])
-        parameters = sum(tensor.size for tensor in load_weights(start.weights).tensors.values())
-        return estimate(self._settings, rounds, training, held_back, camera.width * camera.height, parameters)
 
     def reference(self, split: Split) -> tuple[list[ReferencePart], list[ReferencePart]]:
         """The fixed run over all frames, with depth of either part from its own frames: training, held back.
@@ -274,14 +264,6 @@ class _TrainThere:
 
     def __call__(self, job: TrainingJob, tick: Callable[[], None]) -> None:
         self.train(job)
-
-
-def _camera(part: Part) -> Camera:
-    """Of the first recording that can be opened."""
-    for path in part.paths[:-1]:
-        with suppress(InputError):
-            return open_sequence(path, part.sequence).camera
-    return open_sequence(part.paths[-1], part.sequence).camera
 
 
 def _length(path: Path, how: SequenceSettings) -> int:

@@ -269,7 +269,12 @@ def _notes(report: dict[str, Any], quality: dict[str, int]) -> str:
     if len(report["segments"]) > 1:
         starts = ", ".join(str(segment["first"]) for segment in report["segments"][1:])
         notes.append(f"tracking began anew at frame {starts}")
-    reasons = {"high_error": "that fit badly", "little_parallax": "of little parallax", "contradicted": "in doubt"}
+    reasons = {
+        "high_error": "that fit badly",
+        "little_parallax": "of little parallax",
+        "contradicted": "in doubt",
+        "doubtful": "of a doubtful path",
+    }
     notes += [f"{quality[name]} {words}" for name, words in reasons.items() if quality[name]]
     return "; ".join(notes)
 

@@ -25,6 +25,7 @@ from improvo.labeling.quality import (
     withhold_labels,
 )
 from improvo.odometry.run import RunSummary, run_odometry
+from improvo.odometry.told_verdicts import doubtful_frames
 from improvo.stability.settings import LabelSettings
 from improvo.stability.tables import (
     POINTS_FILE,
@@ -108,7 +109,9 @@ def apply_quality_gate(run: RunSummary, settings: LabelSettings) -> LabeledRun:
         error[some.start : some.stop], parallax[some.start : some.stop] = frame_medians(observations, facts, some)
     events = run.report["events"]
     alarms = np.array([event["frame_index"] for event in events if event["kind"] == "contradiction"], np.int64)
-    quality = assess_frames(error, parallax, run.trajectory.valid, alarms, settings, run.trajectory.segment)
+    segment = run.trajectory.segment
+    in_doubt = doubtful_frames(run.report, segment)
+    quality = assess_frames(error, parallax, run.trajectory.valid, alarms, settings, segment, in_doubt)
     counts: Counter[str] = Counter()
     if settings.quality.enabled:
         doubtful = doubtful_tracks(read_observations(tracks_file), facts, quality.trusted, settings)

@@ -1,9 +1,9 @@
 """The quality gate, which the paper does not have: no labels where the odometry itself is not to be trusted.
 
 A large error says "unstable point" only if the pose is right. A small one says "stable point" only if the camera's
-motion could have contradicted it. So four kinds of frames are not trusted: frames without a pose, frames that all their
-long tracks fit badly, frames of little parallax, and frames before an alarm of the odometry. A track that lives mostly
-in such frames keeps its errors, but its label is withheld.
+motion could have contradicted it. So five kinds of frames are not trusted: frames without a pose, frames that all their
+long tracks fit badly, frames of little parallax, frames before an alarm of the odometry, and frames of a segment whose
+verdict is `doubtful`. A track that lives mostly in such frames keeps its errors, but its label is withheld.
 
 Observations are looked at a part at a time, so that memory does not grow with them; a number for each frame and for
 each track is kept.
@@ -34,11 +34,12 @@ class FrameQuality:
     high_error: Mask  # (F,)
     little_parallax: Mask  # (F,)
     contradicted: Mask  # (F,)
+    doubtful: Mask  # (F,) the odometry does not believe the path of its segment
 
     @property
     def trusted(self) -> Mask:
         """(F,) no reason against it."""
-        return ~(self.no_pose | self.high_error | self.little_parallax | self.contradicted)
+        return ~(self.no_pose | self.high_error | self.little_parallax | self.contradicted | self.doubtful)
 
     def counts(self) -> dict[str, int]:
         """Frames per reason, and in all."""
@@ -90,6 +91,7 @@ def assess_frames(
     contradictions: Int64,
     settings: LabelSettings,
     segment: Int64 | None = None,
+    doubtful: Mask | None = None,
 ) -> FrameQuality:
     """Assess every frame of a finished sequence.
 
@@ -100,6 +102,7 @@ def assess_frames(
         settings: of the labels; `settings.quality` has the limits.
         segment: (F,) final segment of each frame, -1 without a pose. After a contradiction the odometry starts a map
             anew over frames that have misled it once, so all from the segment's first frame on are doubted.
+        doubtful: (F,) frames of segments with a doubtful verdict; None: there are none.
     """
     limits = settings.quality
     contradicted = np.zeros(len(has_pose), np.bool_)
@@ -113,6 +116,7 @@ def assess_frames(
         high_error=median_error > limits.max_median_error,
         little_parallax=median_parallax_deg < limits.min_median_parallax_deg,
         contradicted=contradicted,
+        doubtful=np.zeros_like(contradicted) if doubtful is None else doubtful,
     )
 
 

@@ -29,6 +29,7 @@ from typing import Any
 from improvo.continuation import SettingsRecord
 from improvo.errors import InputError, OutputError
 from improvo.files import (
+    check_folder_format,
     check_output_folder,
     is_being_written,
     make_output_folder,
@@ -239,6 +240,7 @@ def read_records(folder: Path) -> list[SequenceRecord]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; `improvo label` makes it")
+    check_folder_format(folder)
     files = [*folder.glob(f"*/{RECORD_FILE}"), *folder.glob(".*.failed.json")]
     records: dict[str, SequenceRecord] = {}
     for file in files:
