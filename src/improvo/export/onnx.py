@@ -44,7 +44,7 @@ def export_onnx(weights: Weights, path: Path, settings: NetworkSettings, layout:
         name: (name == "valid", [width if side == "width" else side for side in shapes[name]])
         for name in (shapes if for_opencv else outputs)
     }
-    size = [1, 3, "height", "width"] if for_opencv else ["batch", 1, "height", "width"]
+    size: list[int | str] = [1, 3, "height", "width"] if for_opencv else ["batch", 1, "height", "width"]
     model = graph.model(weights.architecture.name, described_outputs, size)
     described = {"model_card": config.to_dict(weights.card), "settings": config.to_dict(settings)}
     onnx.helper.set_model_props(model, {name: json.dumps(value) for name, value in described.items()})
