@@ -35,7 +35,7 @@ from improvo.frontend.registry import load_frontend
 from improvo.geometry.ransac import robust_solver
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.visual_odometry import VisualOdometry
-from improvo.sequences import SequenceSettings, open_sequence
+from improvo.sequences import Sequence, SequenceSettings, open_sequence
 from improvo.types import Features, Trajectory
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -111,15 +111,15 @@ def runs(
             settings = OdometrySettings(mode=mode, seed=seed)
             start = time.perf_counter()
             odometry = VisualOdometry(frontend, sequence.camera, settings)
-            track(odometry, detected)
+            track(odometry, detected, sequence)
             odometry_ms = 1e3 * (time.perf_counter() - start) / len(detected)
             yield measured(folder.name, frontend_name, mode, seed, odometry, truth, frontend_ms, odometry_ms)
 
 
-def track(odometry: VisualOdometry, detected: list[tuple[float, Features]]) -> None:
+def track(odometry: VisualOdometry, detected: list[tuple[float, Features]], sequence: Sequence) -> None:
     """The whole sequence."""
-    for seconds, features in detected:
-        odometry.track_features(features, seconds)
+    for (seconds, features), frame in zip(detected, sequence, strict=True):
+        odometry.track_features(features, seconds, frame.image)
     odometry.finish()
 
 

@@ -171,7 +171,7 @@ def _render(settings: SimulationSettings, scene: Scene, frames: Any, motion: str
     images = np.empty((len(frames), settings.height, settings.width), np.uint8)
     with SceneRenderer(scene, camera) as renderer:
         for row, (frame, time) in enumerate(zip(frames.tolist(), times.tolist(), strict=True)):
-            perfect = renderer.image(time, poses[row])
+            perfect = renderer.image(time, poses[row], shadows=False)  # cast shadows take most of the time
             depth, geom = renderer.geometry(time, poses[row])
             geoms = (renderer.geom_poses(time), renderer.geom_poses(time + _INSTANT))
             motions = (poses[row], poses_after[row])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -23,6 +24,7 @@ WRONG_PERCENT = 5.0
 RIGHT_ROTATION_DEG = 2.0  # over a second
 MIN_FRAMES = 20  # of a segment, for it to count
 MIN_PATH = 0.02  # metres; without a path, an error has no share of it
+DOUBTS = ("two motions", "focal length")  # events that say that the segment may be wrong
 RIGHT, WRONG, NONE, IMPOSSIBLE, POSE_OF_NOTHING = "R", "w", ".", "x", "X"  # of a frame
 
 
@@ -124,24 +126,28 @@ def run_and_judge(clip: Clip, features: list[Features], frontend: Any, seed: int
                 restarts.append(Alarm(number, event.detail, error, error is not None and error < RIGHT_PERCENT))
     odometry.finish()
     estimate = odometry.trajectory
-    segments = [_judged(segment, estimate, truth, odometry) for segment in odometry.segments]
+    segments = [_judged(segment, estimate, truth, odometry.events) for segment in odometry.segments]
     alarms = restarts + [
-        Alarm(segment.last, segment.doubt, segment.error_percent, segment.right)
-        for segment in segments
-        if segment.doubt
+        Alarm(each.last, each.doubt, each.error_percent, each.right)
+        for each in segments
+        if each.doubt and not each.doubt.startswith("not judged")  # which is neither a claim nor an alarm
     ]
     return Judged(_frames(clip, estimate, truth, segments), segments, alarms, list(odometry.events))
 
 
-def doubt(segment: Segment, odometry: VisualOdometry) -> str:
+def doubt(segment: Segment, events: Sequence[Event]) -> str:
     """What the run itself says against a segment; empty where it claims that it is right."""
+    said = [each.detail for each in events if each.kind in DOUBTS and segment.first <= each.frame_index <= segment.last]
+    if said:
+        return said[0]
+    if segment.reason.startswith("contradicted"):
+        return segment.reason
     verdict = getattr(segment, "verdict", None)
-    if verdict is not None:
-        return "" if getattr(verdict, "trusted", True) else str(getattr(verdict, "detail", verdict))
-    return segment.reason if segment.reason.startswith("contradicted") else ""
+    word = getattr(verdict, "word", "right")
+    return "" if word == "right" else f"{word}: {'; '.join(getattr(verdict, 'evidence', ()))}"
 
 
-def _judged(segment: Segment, estimate: Trajectory, truth: Trajectory, odometry: VisualOdometry) -> JudgedSegment:
+def _judged(segment: Segment, estimate: Trajectory, truth: Trajectory, events: Sequence[Event]) -> JudgedSegment:
     path, error = _error_percent(estimate, truth, segment.number)
     return JudgedSegment(
         segment.number,
@@ -151,7 +157,7 @@ def _judged(segment: Segment, estimate: Trajectory, truth: Trajectory, odometry:
         path,
         error,
         segment.reason,
-        doubt(segment, odometry),
+        doubt(segment, events),
     )
 
 

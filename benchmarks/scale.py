@@ -2,12 +2,14 @@
 
     python benchmarks/scale.py training --folder TMP [--frames 1000 10000 100000] [--steps 60] [--json FILE]
     python benchmarks/scale.py workers SEQUENCE... --folder TMP
-    python benchmarks/scale.py labelling SEQUENCE --folder TMP [--frames 2000 20000]
+    python benchmarks/scale.py labelling IMAGES --folder TMP [--frames 2000 20000]
+    python benchmarks/scale.py plan SEQUENCE... --folder TMP
 
 `training` makes label stores without running odometry (`synthetic_labels.py`) and trains on each in a process of its
 own, twice: the first start prepares the labels. `workers` labels the same recordings with one worker and with two, in
-turn; it needs two free cores to say anything. `labelling` shows one recording again and again and measures the memory
-of the process that labels it.
+turn; it needs two free cores to say anything. `labelling` shows the pictures of a folder forth and back, and measures
+the memory of the process that labels them. `plan` compares what `improvo label --plan` says with the processor time
+that `improvo label` then takes.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ _KIB_PER_MIB = 1024
 def main() -> None:
     """Measure, print, and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("training", "workers", "labelling", "one-training", "one-labelling"))
+    parser.add_argument("what", choices=(*MEASURES, "one-training", "one-labelling"))
     parser.add_argument("sequences", nargs="*", type=Path, help="recordings; a label store for one-training")
     parser.add_argument("--folder", type=Path, required=True, help="for stores and results; kept")
     parser.add_argument("--frames", type=int, nargs="+")
@@ -43,10 +45,9 @@ def main() -> None:
         print(json.dumps(one_training(arguments.sequences[0], arguments.folder, arguments.steps, arguments.frontend)))
         return
     if arguments.what == "one-labelling":
-        print(json.dumps(one_labelling(arguments.sequences[0], arguments.folder, arguments.frames[0], arguments)))
+        print(json.dumps(one_labelling(arguments.sequences[0], arguments.folder, arguments.frontend)))
         return
-    measure = {"training": training, "workers": workers, "labelling": labelling}[arguments.what]
-    rows = measure(arguments)
+    rows = MEASURES[arguments.what](arguments)
     for row in rows:
         print("  ".join(f"{name} {value}" for name, value in row.items()))
     if arguments.json:
@@ -54,7 +55,7 @@ def main() -> None:
 
 
 def training(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """Peak memory, seconds until the first step, and how fast batches are made, by the size of the store."""
+    """Peak memory, processor time until the first step, and how fast batches are made, by the size of the store."""
     rows = []
     for frames in arguments.frames or (1000, 10_000, 100_000):
         store = write_label_store(arguments.folder / f"labels-{frames}", frames)
@@ -82,11 +83,11 @@ def one_training(store: Path, output: Path, steps: int, frontend: str) -> dict[s
     from improvo.training.trainer import Trainer
 
     settings = OdometryTrainingSettings(optimiser=OptimiserSettings(steps=steps, log_every=5))
-    begun, first_step = time.perf_counter(), []
+    begun, first_step = time.process_time(), []
     run = Trainer.run
 
     def timed(trainer: Trainer, *given: Any, **named: Any) -> Any:
-        first_step.append(time.perf_counter() - begun)
+        first_step.append(time.process_time() - begun)
         return run(trainer, *given, **named)
 
     Trainer.run = timed  # type: ignore[method-assign]
@@ -103,7 +104,7 @@ def one_training(store: Path, output: Path, steps: int, frontend: str) -> dict[s
     feeding = (time.perf_counter() - before) / count
     step_seconds = float(np.median([row["step_seconds"] for row in metrics]))
     return {
-        "start_seconds": round(first_step[0], 2),
+        "start_cpu_seconds": round(first_step[0], 2),
         "trainer_mib": own // _KIB_PER_MIB,
         "feeder_mib": child // _KIB_PER_MIB,
         "batch_seconds": round(feeding, 3),
@@ -131,14 +132,68 @@ def workers(arguments: argparse.Namespace) -> list[dict[str, Any]]:
 
 def labelling(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """Peak memory of a process that labels one recording, by its number of frames."""
+    pictures = sorted(p for p in arguments.sequences[0].iterdir() if p.suffix in (".png", ".jpg"))
     rows = []
     for frames in arguments.frames or (2000, 20_000):
-        folder = arguments.folder / f"labelled-{frames}"
-        shutil.rmtree(folder, ignore_errors=True)
-        options = ["--frames", str(frames), "--frontend", arguments.frontend]
-        found = _in_a_process("one-labelling", str(arguments.sequences[0]), "--folder", str(folder), *options)
-        rows.append({"frames": frames, **found})
+        recording, output = arguments.folder / f"pictures-{frames}", arguments.folder / f"labelled-{frames}"
+        for folder in (recording, output):
+            shutil.rmtree(folder, ignore_errors=True)
+        recording.mkdir(parents=True)
+        for number in range(frames):
+            row = number % (2 * len(pictures) - 2)
+            picture = pictures[min(row, 2 * len(pictures) - 2 - row)]
+            (recording / f"{number:06d}{picture.suffix}").symlink_to(picture.resolve())
+        shutil.copy(arguments.sequences[0] / "camera.yaml", recording)
+        options = ["--frontend", arguments.frontend]
+        rows.append(
+            {"frames": frames, **_in_a_process("one-labelling", str(recording), "--folder", str(output), *options)}
+        )
     return rows
+
+
+def one_labelling(recording: Path, output: Path, frontend: str) -> dict[str, Any]:
+    """In a process of its own, as a worker does it."""
+    from improvo.frontend.settings import FrontendSettings
+    from improvo.jobs.workers import start_worker
+    from improvo.labeling.label_sequences import label_sequences
+    from improvo.odometry.run_settings import LabelRunSettings
+
+    start_worker()
+    settings = LabelRunSettings(frontend=FrontendSettings(name=frontend))
+    (record,) = label_sequences([recording], output, settings)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // _KIB_PER_MIB
+    return {"tracked": record.tracked, "peak_mib": peak, "seconds": record.seconds}
+
+
+def plan(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """Core-seconds as planned, and as one worker process then takes them."""
+    command = [
+        sys.executable,
+        "-m",
+        "improvo",
+        "label",
+        *map(str, arguments.sequences),
+        "--frontend",
+        arguments.frontend,
+    ]
+    said = subprocess.run([*command, "--plan", "--json"], check=True, stdout=subprocess.PIPE, text=True).stdout
+    planned = json.loads(said)
+    store = arguments.folder / "labels-planned"
+    shutil.rmtree(store, ignore_errors=True)
+    before = _children_seconds()
+    subprocess.run([*command, "-o", str(store)], check=True, stdout=subprocess.DEVNULL)
+    taken = _children_seconds() - before
+    files = sum(path.stat().st_size for path in store.rglob("*") if path.is_file()) / (1 << 20)
+    return [{
+        "recordings": planned["recordings"], "frames": planned["frames"],
+        "planned core-seconds": round(3600 * planned["core_hours"], 1), "taken": round(taken, 1),
+        "planned MiB": planned["storage_mib"], "written": round(files, 1),
+    }]  # fmt: skip
+
+
+def _children_seconds() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _in_a_process(*arguments: str) -> dict[str, Any]:
@@ -147,6 +202,8 @@ def _in_a_process(*arguments: str) -> dict[str, Any]:
     answer: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return answer
 
+
+MEASURES = {"training": training, "workers": workers, "labelling": labelling, "plan": plan}
 
 if __name__ == "__main__":
     main()

@@ -7,7 +7,9 @@ from simulated_features import CAMERA, World, error_percent, hand_motion, observ
 
 from improvo.geometry import se3
 from improvo.odometry.attached import AttachedDetector
+from improvo.odometry.local_map import LocalMap
 from improvo.odometry.settings import AttachedSettings, OdometrySettings
+from improvo.odometry.start import start_map
 from improvo.odometry.view import View
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.tracking.connect import TrackChain
@@ -34,6 +36,10 @@ def with_logo(features: Features, seed: int, count: int = 120, noise: float = 0.
     )
 
 
+def with_logos(features: list[Features]) -> list[Features]:
+    return [with_logo(each, number) for number, each in enumerate(features)]
+
+
 def marked(features: list[Features]) -> list[tuple[View, np.ndarray]]:
     """Views of the features, with what the detector marks."""
     detector, chain, found = AttachedDetector(CAMERA, OdometrySettings(), 0.7), TrackChain(), []
@@ -57,7 +63,7 @@ def seen(world_from_cam: Float64, world: World | None = None) -> list[Features]:
 
 
 def test_a_logo_is_marked_and_little_else_is() -> None:
-    features = [with_logo(each, number) for number, each in enumerate(seen(hand_motion(40, step=0.04)))]
+    features = with_logos(seen(hand_motion(40, step=0.04)))
     logo, world = zip(*((mask[:120], mask[120:]) for _, mask in marked(features)[25:]), strict=True)
     assert np.mean(np.concatenate(logo)) > 0.95
     assert np.mean(np.concatenate(world)) < 0.05
@@ -88,7 +94,7 @@ def test_a_person_before_a_still_camera_does_not_make_the_world_attached() -> No
     names /= np.linalg.norm(names, axis=1, keepdims=True)
     features = []
     for number, each in enumerate(still):
-        person = body + (40 + 5 * number, 120) + rng.normal(scale=0.3, size=body.shape)
+        person = body + np.array([40 + 5 * number, 120]) + rng.normal(scale=0.3, size=body.shape)
         both = np.concatenate([each.keypoints, person]).astype(np.float32)
         descriptors = np.concatenate([each.descriptors, names]).astype(np.float32)
         features.append(Features(both, descriptors, np.ones(len(both), np.float32)))
@@ -119,3 +125,13 @@ def test_odometry_with_a_logo_is_right_and_says_so() -> None:
         said = [event for event in odometry.events if event.kind == "attached"]
         assert bool(said) is enabled
     assert errors[True] < 2.0 < errors[False], errors
+
+
+def test_tracks_of_a_logo_are_no_overlap_for_a_start() -> None:
+    """The camera turns away from what it saw at first, and only the logo is still there."""
+    views = [view for view, _ in marked(with_logos(seen(hand_motion(14, step=0.06, turn_deg=4.0))))]
+    for view in views:
+        view.attached = np.arange(len(view)) < 120
+    started = start_map(views, CAMERA, OdometrySettings(), 0.7)
+    assert isinstance(started, LocalMap), started
+    assert views[-1].cam_from_world is not None

@@ -30,13 +30,14 @@ if TYPE_CHECKING:
     from improvo.odometry.settings import OdometrySettings
     from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
     from improvo.presets import preset
+    from improvo.self_calibration.settings import SelfCalibrationSettings
     from improvo.sequences import Sequence, SequenceSettings, open_sequence
     from improvo.stability.rule import label_stability
     from improvo.stability.settings import LabelSettings
     from improvo.tracking.matching import mutual_nearest_neighbours as match
     from improvo.training.settings import OdometryTrainingSettings
     from improvo.types import Features, Frame, SparseMap, Tracks, Trajectory
-    from improvo.verbs import evaluate_pose, evaluate_trajectory, improve, label, run, train_odometry
+    from improvo.verbs import evaluate_pose, evaluate_trajectory, find_camera, improve, label, run, train_odometry
 
 __version__ = "0.1.0"
 
@@ -59,6 +60,7 @@ _PUBLIC = {
     "load_frontend": "improvo.frontend.registry",
     "match": "improvo.tracking.matching:mutual_nearest_neighbours",
     "label_stability": "improvo.stability.rule",
+    "find_camera": "improvo.verbs",
     "run": "improvo.verbs",
     "label": "improvo.verbs",
     "train_odometry": "improvo.verbs",
@@ -78,6 +80,7 @@ _PUBLIC = {
     "OdometryTrainingSettings": "improvo.training.settings",
     "ImproveSettings": "improvo.improvement.settings",
     "PoseSettings": "improvo.evaluation.settings",
+    "SelfCalibrationSettings": "improvo.self_calibration.settings",
     "TrajectorySettings": "improvo.evaluation.settings",
     # errors
     "ImprovoError": "improvo.errors",
@@ -108,6 +111,7 @@ __all__ = [
     "PoseSettings",
     "RunFolder",
     "RunSettings",
+    "SelfCalibrationSettings",
     "Sequence",
     "SequenceSettings",
     "SparseMap",
@@ -119,6 +123,7 @@ __all__ = [
     "__version__",
     "evaluate_pose",
     "evaluate_trajectory",
+    "find_camera",
     "improve",
     "label",
     "label_stability",

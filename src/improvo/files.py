@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
 import secrets
 import shutil
+import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from improvo import locations
 from improvo.errors import InputError, OutputError
 from improvo.formats import FORMAT, FORMAT_KEY, check_format
 from improvo.untrusted.paths import check_path
@@ -23,7 +27,9 @@ if TYPE_CHECKING:
 
 MARKER = ".improvo.json"
 FORMER_NAME = "sivo"  # of this package; folders and weights written under it stay readable
-_TEMPORARY = re.compile(r"\..+\.(\d+)(?:-\w+)?\.partial(?:\..*)?", re.DOTALL)  # .NAME.PROCESS-CHANCE.partial.SUFFIX
+_TEMPORARY = re.compile(r"\..+\.(\d+)(?:-(\w+))?\.partial(?:\..*)?", re.DOTALL)  # see `temporary_name`
+_HOST = hashlib.sha256(socket.gethostname().encode()).hexdigest()[:6]
+_FOREIGN_SECONDS = 86400.0  # after which a temporary file of another machine is of a process that ended
 _LONGEST_NAME = 100  # characters of a name that go into that of its temporary file
 _open_here: set[str] = set()  # names of temporary files and folders that this process is writing
 
@@ -44,6 +50,8 @@ def written_atomically(path: Path) -> Iterator[Path]:
         _open_here.add(temporary.name)
         yield temporary
         os.replace(temporary, path)
+        made = False
+        locations.written(path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error}); choose another folder") from None
     finally:
@@ -54,8 +62,11 @@ def written_atomically(path: Path) -> Iterator[Path]:
 
 
 def temporary_name(name: str, suffix: str = "") -> str:
-    """A hidden name for what is not complete; nobody can guess it, and `clear_leftovers` knows whose it was."""
-    return f".{name[:_LONGEST_NAME]}.{os.getpid()}-{secrets.token_hex(4)}.partial{suffix[:20]}"
+    """A hidden name for what is not complete; nobody can guess it, and `clear_leftovers` knows whose it was.
+
+    .NAME.PROCESS-MACHINE+CHANCE.partial.SUFFIX
+    """
+    return f".{name[:_LONGEST_NAME]}.{os.getpid()}-{_HOST}{secrets.token_hex(4)}.partial{suffix[:20]}"
 
 
 def clear_leftovers(folder: Path) -> None:
@@ -63,14 +74,28 @@ def clear_leftovers(folder: Path) -> None:
     for place, folders, names in os.walk(folder):
         for name in [*names, *folders]:
             match = _TEMPORARY.fullmatch(name)
-            if match is None or name in _open_here or _is_running(int(match.group(1)[:9])):
-                continue
             leftover = Path(place) / name
+            if match is None or is_being_written(leftover):
+                continue
             if leftover.is_dir() and not leftover.is_symlink():
                 shutil.rmtree(leftover, ignore_errors=True)
             else:
                 with suppress(OSError):
                     leftover.unlink(missing_ok=True)
+
+
+def is_being_written(path: Path) -> bool:
+    """Whether this is a temporary file or folder, and the process that made it may still write it."""
+    match = _TEMPORARY.fullmatch(path.name)
+    if match is None:
+        return False
+    process, token = int(match.group(1)[:9]), match.group(2) or ""
+    if len(token) == len(_HOST) + 8 and not token.startswith(_HOST):  # of another machine, on a shared file system
+        try:
+            return time.time() - path.lstat().st_mtime < _FOREIGN_SECONDS
+        except OSError:
+            return True
+    return path.name in _open_here or _is_running(process)
 
 
 def _is_running(process: int) -> bool:

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any, TextIO, TypeVar
 
 T = TypeVar("T")
 
 INTERVAL = 20.0  # seconds between two lines, where there is no terminal
 _quiet = False
+
+
+def counted(count: int, unit: str) -> str:
+    """`1 frame`, `2 frames`."""
+    return f"{count} {unit}" if count == 1 else f"{count} {unit}s"
 
 
 @contextmanager
@@ -68,12 +73,45 @@ def each(items: Collection[T], words: str, unit: str, shown: bool = True) -> Ite
             told.advance()
 
 
+@contextmanager
+def stages(unit: str) -> Iterator[Callable[[str, int, int], None]]:
+    """Show the progress of work with several stages, each as a `progress` of its own.
+
+    Yields:
+        What to tell: the stage in words, how many are done, and of how many.
+    """
+    before: dict[str, int] = {}  # stage -> how many were done when it was last heard of
+    bar = Progress()
+    with ExitStack() as shown:
+
+        def told(stage: str, done: int, total: int) -> None:
+            nonlocal bar
+            if stage not in before:
+                shown.close()
+                bar = shown.enter_context(progress(stage, unit, total))
+            bar.advance(done - before.get(stage, 0))
+            before[stage] = done
+
+        yield told
+
+
 class _Bar(Progress):
+    """The clock starts with the first unit: what comes before it, such as loading, would spoil the first estimates."""
+
     def __init__(self, bar: Any) -> None:
         self._bar = bar
+        self._began = False
 
     def advance(self, count: int = 1) -> None:
-        self._bar.update(count)
+        if self._began:
+            self._bar.update(count)
+            return
+        self._began = True
+        bar = self._bar
+        bar.n += count
+        bar.initial = bar.last_print_n = bar.n
+        bar.start_t = bar.last_print_t = time.time()
+        bar.refresh()
 
     def describe(self, words: str) -> None:
         self._bar.set_description(words)
@@ -87,11 +125,14 @@ class _Lines(Progress):
         self._words, self._unit, self._total, self._stream = words, unit, total, stream
         self._first = self._done = done
         self._note = ""
-        self._began = self._said = time.monotonic()
+        self._said = time.monotonic()
+        self._began: float | None = None  # when the first unit was done: the rate is that of the others
 
     def advance(self, count: int = 1) -> None:
         self._done += count
         now = time.monotonic()
+        if self._began is None:
+            self._began, self._first = now, self._done
         if now - self._said >= INTERVAL:
             self._said = now
             print(self._text(now - self._began), file=self._stream, flush=True)
@@ -104,13 +145,14 @@ class _Lines(Progress):
 
     def _text(self, seconds: float) -> str:
         rate = (self._done - self._first) / max(seconds, 1e-9)
-        text = f"{self._words}: {self._done}"
+        speed = f", {rate:.3g} a second" if rate > 0 else ""
         if self._total:
-            text += f" of {self._total} {self._unit}s ({100 * self._done // self._total} %), {rate:.3g} a second"
+            share = 100 * self._done // self._total
+            text = f"{self._words}: {self._done} of {counted(self._total, self._unit)} ({share} %){speed}"
             if rate > 0:
                 text += f", {_duration((self._total - self._done) / rate)} left"
         else:
-            text += f" {self._unit}s, {rate:.3g} a second"
+            text = f"{self._words}: {counted(self._done, self._unit)}{speed}"
         return f"{text}; {self._note}" if self._note else text
 
 

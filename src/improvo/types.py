@@ -110,6 +110,7 @@ class SparseMap:
     mean_error: Float64  # (P,) pixels
     max_error: Float64  # (P,) pixels
     segment: Int64  # (P,) segment that the point belongs to
+    rgb: UInt8 | None = None  # (P, 3) as the recording shows it; None where that is not known
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -6,9 +6,11 @@ Nothing is printed. Heavy libraries load when a verb is called.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from improvo.locations import local_folder, publish
 
 if TYPE_CHECKING:
     from improvo.evaluation.settings import PoseSettings, TrajectorySettings
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
     from improvo.labeling.labeler import LabeledRun
     from improvo.labeling.store import SequenceRecord
     from improvo.odometry.run_settings import RunSettings
+    from improvo.self_calibration.from_motion import CameraFromMotion
+    from improvo.self_calibration.settings import SelfCalibrationSettings
     from improvo.sequences import Sequence as ImageSequence
     from improvo.sequences import SequenceSettings
     from improvo.training.settings import OdometryTrainingSettings
@@ -49,26 +53,35 @@ def run(
     """
     from improvo.depth.dense import refuse_live, write_dense
     from improvo.depth.run_settings import DenseRunSettings
+    from improvo.folder_lock import working_in
     from improvo.labeling.labeler import run_and_label
     from improvo.odometry.run_settings import RunSettings
     from improvo.odometry.scale.apply import apply_scale
     from improvo.odometry.scale.settings import ScaleSettings
     from improvo.odometry.scale.sources import scale_source
+    from improvo.self_calibration.found_cameras import with_camera_note
     from improvo.sequences import open_sequence
+    from improvo.sequences.rates import AUTO
 
     settings = settings or RunSettings()
+    folder = local_folder(output)
     if isinstance(sequence, str | Path):
+        if settings.sequence.camera == AUTO:
+            settings = replace(settings, sequence=_found([sequence], settings.sequence, folder, "run"))
         sequence = open_sequence(sequence, settings.sequence)
     depth = settings.depth if isinstance(settings, DenseRunSettings) and settings.dense else None
     if depth is not None:
         refuse_live(sequence)
     scale = settings.scale if isinstance(settings, DenseRunSettings) else ScaleSettings()
     ask = scale_source(sequence, scale)  # before any work
-    result = run_and_label(sequence, Path(output), settings, frontend=frontend)
-    if ask is not None:
-        result = apply_scale(sequence, result, ask, scale)
-    if depth is not None:
-        write_dense(sequence, result, depth)
+    with working_in(folder, "run"):
+        result = run_and_label(sequence, folder, settings, frontend=frontend)
+        result = with_camera_note(result, settings.sequence.camera)
+        if ask is not None:
+            result = apply_scale(sequence, result, ask, scale)
+        if depth is not None:
+            write_dense(sequence, result, depth)
+    publish(folder)
     return result
 
 
@@ -99,7 +112,41 @@ def label(
     from improvo.odometry.run_settings import LabelRunSettings
 
     chosen = settings or LabelRunSettings()
-    return label_sequences([Path(path) for path in sequences], Path(output), chosen, workers, ray=ray)
+    folder = local_folder(output)
+    chosen = replace(chosen, sequence=_found(sequences, chosen.sequence, folder, "label"))
+    records = label_sequences([Path(path) for path in sequences], folder, chosen, workers, ray=ray)
+    publish(folder)
+    return records
+
+
+def find_camera(sequence: PathLike, settings: SelfCalibrationSettings | None = None) -> CameraFromMotion:
+    """The camera of a video from its own motion, as `improvo calibrate` finds it without a board.
+
+    Args:
+        sequence: path of a recording whose camera moves sideways and turns.
+        settings: all numbers.
+
+    Returns:
+        Camera, standard deviations, and `write("camera.yaml")`.
+
+    Raises:
+        InputError: the recording cannot be read, or its motion leaves the camera open.
+    """
+    from improvo.self_calibration.from_motion import camera_from_motion
+
+    return camera_from_motion(sequence, settings)
+
+
+def _found(sequences: Sequence[PathLike], settings: SequenceSettings, folder: Path, command: str) -> SequenceSettings:
+    """Settings with files in place of the camera `auto`, which are left in the output folder."""
+    from improvo.files import make_output_folder
+    from improvo.self_calibration.found_cameras import find_cameras
+    from improvo.sequences.rates import AUTO
+
+    if settings.camera != AUTO:
+        return settings
+    make_output_folder(folder, command)
+    return find_cameras([Path(path) for path in sequences], settings, folder)
 
 
 @dataclass(frozen=True)
@@ -138,10 +185,17 @@ def train_odometry(
     need_torch()
     from improvo.training import stages
 
-    settings, folder = settings or OdometryTrainingSettings(), Path(output)
+    settings, folder = settings or OdometryTrainingSettings(), local_folder(output)
     metrics = stages.train_odometry(
-        [Path(path) for path in labels], settings, folder, find_weights(start), tuple(data), False, list(pictures)
+        [local_folder(path, writing=False) for path in labels],
+        settings,
+        folder,
+        find_weights(start),
+        tuple(data),
+        False,
+        list(pictures),
     )
+    publish(folder)
     return Trained(folder / "weights.safetensors", metrics)
 
 
@@ -166,6 +220,7 @@ def improve(
     rounds: int = 1,
     evaluate: Sequence[PathLike] = (),
     workers: int = 1,
+    after: PathLike | None = None,
 ) -> Improvement:
     """The loop: label, train, validate, and keep the better weights, as `improvo improve` does it.
 
@@ -176,6 +231,7 @@ def improve(
         rounds: of labelling, training and validation.
         evaluate: recordings to hold out; without any, some of `sequences`, or the last part of a single one.
         workers: sequences labelled at a time.
+        after: finished folder of an earlier call, whose recordings are replayed and must not get worse.
 
     Raises:
         MissingExtraError: torch is not installed.
@@ -187,7 +243,13 @@ def improve(
     from improvo.improvement.settings import ImproveSettings
 
     recordings, held_out = [Path(path) for path in sequences], [Path(path) for path in evaluate]
-    return run_rounds(recordings, Path(output), settings or ImproveSettings(), rounds, held_out, workers)
+    folder = local_folder(output)
+    settings = settings or ImproveSettings()
+    settings = replace(settings, sequence=_found([*recordings, *held_out], settings.sequence, folder, "improve"))
+    before = local_folder(after) if after is not None else None
+    result = run_rounds(recordings, folder, settings, rounds, held_out, workers, after=before)
+    publish(folder)
+    return result
 
 
 @dataclass(frozen=True)

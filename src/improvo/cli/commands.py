@@ -192,7 +192,12 @@ COMMANDS: dict[str, Command] = {
         "improvo.sequences.settings:InfoSettings",
         figures=True,
     ),
-    "calibrate": Command("a camera from a recording of a board, and the board to print", "calibrate"),
+    "calibrate": Command(
+        "a camera from the motion of any video, or from a recording of a board",
+        "calibrate",
+        "improvo.self_calibration.settings:SelfCalibrationSettings",
+        figures=True,
+    ),
     "simulate": Command(
         "render rooms with exact depth, poses and causes of instability",
         "simulate",
@@ -200,4 +205,5 @@ COMMANDS: dict[str, Command] = {
     ),
     "demo": Command("the main job on a small bundled recording, in minutes", "demo"),
     "config": Command("print all settings of a command as YAML", "config"),
+    "completion": Command("a completion script for bash, zsh or fish", "completion"),
 }

@@ -8,13 +8,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.evaluate_options import (
     add_frontend_arguments,
     add_run_arguments,
     add_truth_argument,
 )
 from improvo.cli.evaluate_trajectory import TRAJECTORY_FLAGS, add_trajectory_arguments
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import figures, next_step
 from improvo.evaluation.settings import VoCommandSettings
 
@@ -30,7 +31,7 @@ _FLAGS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `improvo evaluate vo`; `--stride` is 10 unless given."""
     defaults = VoCommandSettings()
-    parser.add_argument("sequences", nargs="+", type=Path, metavar="SEQUENCE", help="with true poses")
+    parser.add_argument("sequences", nargs="+", type=recording_path, metavar="SEQUENCE", help="with true poses")
     add_truth_argument(parser)
     add_frontend_arguments(parser, defaults.max_keypoints)
     parser.add_argument(
@@ -60,6 +61,7 @@ def run(arguments: argparse.Namespace) -> int | None:
     output: Path | None = arguments.output
     if output is not None:
         check_output_folder(output, COMMAND)
+    settings = with_found_camera(settings, arguments.sequences, output, COMMAND)
     frontends, _ = loaded_frontends(arguments.frontend, settings.max_keypoints, ["superpoint-vo"])
     sources = recorded_sequences(arguments, settings.sequence)
     with Workers(arguments.workers, progress=True) as workers:

@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.flags import add_setting
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import figures, next_step, say
@@ -39,7 +40,7 @@ def run(arguments: argparse.Namespace) -> None:
     from improvo.sequences.survey import survey
     from improvo.terminal import progress
 
-    settings = settings_from(InfoSettings, arguments)
+    settings = with_found_camera(settings_from(InfoSettings, arguments), [arguments.sequence], None, "info")
     with progress("info", "pair") as shown:
         findings = survey(arguments.sequence, settings.sequence, max(1, settings.samples), shown.advance).to_dict()
     lines = [f"{name:<14} {text}" for name, text in _lines(findings)]

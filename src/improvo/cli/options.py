@@ -35,11 +35,15 @@ _SEQUENCE_OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 
-def add_sequence_arguments(parser: argparse.ArgumentParser, defaults: SequenceSettings | None = None) -> None:
-    """How the sequence is read; read back by `settings_from`."""
+def add_sequence_arguments(
+    parser: argparse.ArgumentParser, defaults: SequenceSettings | None = None, without: tuple[str, ...] = ()
+) -> None:
+    """How the sequence is read, all but the options `without`; read back by `settings_from`."""
     group = parser.add_argument_group("how the sequence is read")
     defaults = defaults or SequenceSettings()
     for name, options in _SEQUENCE_OPTIONS.items():
+        if name in without:
+            continue
         add_setting(group, defaults, f"--{name.replace('_', '-')}", name, section="sequence.", **options)
 
 
@@ -82,6 +86,20 @@ def recording_path(text: str) -> Path:
     from improvo.simulation import bundled_sequence
 
     return bundled_sequence()
+
+
+def folder_path(text: str) -> Path:
+    """The type of an argument that names a folder to write in, here or at a location such as `s3://bucket/folder`."""
+    from improvo.locations import local_folder
+
+    return local_folder(text)
+
+
+def read_folder_path(text: str) -> Path:
+    """As `folder_path`, of a folder that is only read."""
+    from improvo.locations import local_folder
+
+    return local_folder(text, writing=False)
 
 
 def check_recordings(paths: list[Path]) -> None:

@@ -11,8 +11,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from improvo import terminal
+from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.evaluate_options import available_cores
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import figures, next_step
 from improvo.evaluation.truth.settings import CALIBRATE, TruthCommandSettings, TruthSettings
 
@@ -22,7 +23,7 @@ _FLAGS = {"calibrate": "truth.calibrate", "max_features": "truth.max_features", 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `improvo truth`."""
     defaults, absent = TruthSettings(), argparse.SUPPRESS
-    parser.add_argument("sequence", type=Path, metavar="SEQUENCE")
+    parser.add_argument("sequence", type=recording_path, metavar="SEQUENCE")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", required=True, help="poses and camera")
     parser.add_argument("--scale-from", metavar="POSES", help="poses in metres, where the recording has no depth")
     parser.add_argument("--model", type=Path, metavar="DIR", help="a COLMAP model, instead of making one")
@@ -48,27 +49,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write FILE and its quality as JSON beside it; print the quality."""
-    from contextlib import ExitStack
-
     from improvo.evaluation.truth.make import make_truth
     from improvo.evaluation.truth.structure_from_motion import load_pycolmap
     from improvo.sequences import open_sequence
 
     settings = settings_from(TruthCommandSettings, arguments, _FLAGS)
     load_pycolmap()  # said before any work
+    settings = with_found_camera(settings, [arguments.sequence], None, "truth")
     sequence = open_sequence(arguments.sequence, settings.sequence)
-    before: dict[str, int] = {}  # stage -> how many were done when it was last heard of
-    bar = terminal.Progress()
-
-    def told(stage: str, done: int, total: int) -> None:
-        nonlocal bar
-        if stage not in before:
-            stages.close()
-            bar = stages.enter_context(terminal.progress(stage, "step", total))
-        bar.advance(done - before.get(stage, 0))
-        before[stage] = done
-
-    with ExitStack() as stages:
+    with terminal.stages("step") as told:
         quality = make_truth(
             sequence,
             arguments.output,

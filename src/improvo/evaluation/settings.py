@@ -14,6 +14,9 @@ from improvo.sequences.base import SequenceSettings
 ESTIMATORS = ("opencv", "poselib", "usac")
 DEFAULT_ESTIMATORS = ("opencv", "poselib" if poselib_installed() else "usac")
 
+# what frames of `redkitchen` (30 Hz) show of each other 30, 60 and 90 frames apart, in the median
+USUAL_OVERLAPS = (0.8, 0.6, 0.45)
+
 ALIGNMENTS = ("sim3", "se3", "none")
 
 
@@ -22,6 +25,8 @@ class PoseSettings:
     """The pose protocol; the defaults are the paper's."""
 
     gaps: tuple[int, ...] = (30, 60, 90)  # frames between A and B, as delivered (after any stride)
+    gap_seconds: tuple[float, ...] = ()  # in place of `gaps`: seconds between A and B
+    overlaps: tuple[float, ...] = ()  # in place of `gaps`: shares of A that B shows too, the largest first
     pairs: int = 50  # random pairs per sequence and gap
     max_keypoints: int = 500
     estimators: tuple[str, ...] = DEFAULT_ESTIMATORS  # opencv is the paper's; poselib, usac (OpenCV's) are robust
@@ -41,6 +46,15 @@ class PoseSettings:
     def __post_init__(self) -> None:
         if not self.gaps or min(self.gaps) < 1 or len(set(self.gaps)) < len(self.gaps):
             raise ConfigError(f"gaps {list(self.gaps)}: give different numbers of frames, each 1 or more")
+        if self.gap_seconds and self.overlaps:
+            raise ConfigError("gap_seconds and overlaps: give one of them")
+        if not all(math.isfinite(each) and each > 0 for each in self.gap_seconds):
+            raise ConfigError(f"gap_seconds {list(self.gap_seconds)}: must be positive")
+        falling = list(self.overlaps) == sorted(set(self.overlaps), reverse=True)
+        if not falling or not all(0 < each < 1 for each in self.overlaps):
+            raise ConfigError(
+                f"overlaps {list(self.overlaps)}: give shares below 1, the largest first, such as 0.8 0.6"
+            )
         if min(self.pairs, self.resamples, self.shuffles) < 1 or self.max_keypoints < 4:
             raise ConfigError("pairs, resamples and shuffles must be at least 1, max_keypoints at least 4")
         unknown = set(self.estimators) - set(ESTIMATORS)

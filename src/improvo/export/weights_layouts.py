@@ -202,6 +202,6 @@ def _write_tensors(path: Path, tensors: Tensors, metadata: dict[str, str]) -> No
     try:
         import torch
     except ImportError:
-        raise MissingExtraError("writing a torch file (a .safetensors file needs none)", "train") from None
+        raise MissingExtraError("writing .pth, unlike .safetensors,", "train") from None
     with files.written_atomically(path) as temporary:
         torch.save({name: torch.from_numpy(values.copy()) for name, values in kept.items()}, temporary)

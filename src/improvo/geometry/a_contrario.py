@@ -1,8 +1,8 @@
 """Is an agreement more than chance? The number of false alarms of a model (Moisan and Stival 2004).
 
-Among unrelated matches, each agrees with a fixed model with a probability that follows from the tolerance and the size of
-the picture. The number of false alarms is how many models with so many inliers are expected among all that RANSAC could
-have drawn from matches without any truth in them. Far under 1, the agreement is none of chance.
+Among unrelated matches, each agrees with a fixed model with a probability that follows from the tolerance and the size
+of the picture. The number of false alarms is how many models with so many inliers are expected among all that RANSAC
+could have drawn from matches without any truth in them. Far under 1, the agreement is none of chance.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """What moves with the camera: a logo, a time stamp, a bonnet, a finger. It stands in the picture while the rest moves.
 
 A map of it fits as well as a map of the world, and says that the camera stands still. So it is found before any map is
-asked. Two views far enough apart in the picture are matched afresh. An essential matrix of the matches that clearly moved
-tells where a point of the world may be found again, at whatever depth: on its half of the epipolar line. A far point under a pure
-translation, the focus of expansion and the axis of a turn lie on their lines though they hardly move. A match that does
-not move and is off it is not of the world. It counts against its cell of the picture, and matches that move with
-the world count for it; both are slowly forgotten. Keypoints of a cell with more against it than for it make no map.
+asked. Two views far enough apart in the picture are matched afresh. An essential matrix of the matches that clearly
+moved tells where a point of the world may be found again, at whatever depth: on its half of the epipolar line. A far
+point under a pure translation, the focus of expansion and the axis of a turn are there though they hardly move. A match
+that does not move and is off it is not of the world. It counts against its cell of the picture, and matches that move
+with the world count for it; both are slowly forgotten. Keypoints of a cell with more against than for it make no map.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ _OFF = 1.5  # times the noise: a match so far from where a point of the world ca
 _KEPT = 0.8  # share of the evidence that is left after each comparison
 _ENOUGH = 3.0  # matches against a cell,
 _MOST = 2  # of which one comparison gives so many
+_SHORTEST = 5  # frames between two views that are compared, where enough tracks last; a slow world moves by then
 _LONGEST = 30  # frames between two views that are compared
 
 
@@ -57,7 +58,8 @@ class AttachedDetector:
     @property
     def cells(self) -> Mask:
         """(C,) cells of the picture, row by row, that show something attached to the camera."""
-        return (self._against >= _ENOUGH) & (self._against > self._for)
+        against, world = _with_neighbours(self._against), _with_neighbours(self._for)
+        return (against >= _ENOUGH) & (against > world)
 
     def observe(self, view: View) -> bool:
         """Mark the keypoints of the newest view.
@@ -90,10 +92,13 @@ class AttachedDetector:
         """With the anchor, where the picture moved enough since then; then this view is the anchor."""
         anchor = self._anchor
         if anchor is not None and view.frame_index - anchor.frame_index <= _LONGEST:
+            # a track that is not younger than the anchor was seen in it, since tracks have no gaps
+            few_left = (view.tracks <= anchor.tracks.max(initial=-1)).sum() < 2 * _MIN_MOVING
+            if not few_left and view.frame_index - anchor.frame_index < _SHORTEST:
+                return
             rows, rows_anchor = common_tracks(view, anchor)
             motion = np.linalg.norm(view.keypoints[rows] - anchor.keypoints[rows_anchor], axis=1)
             moved = motion[motion > _MOVED * self._noise]
-            few_left = len(rows) < 2 * _MIN_MOVING
             if not few_left and (len(moved) < _MIN_MOVING or np.median(moved) < self._settings.min_flow * self._noise):
                 return
             self._weigh(anchor, view)
@@ -126,3 +131,10 @@ class AttachedDetector:
     def _counted(self, cells: Int64) -> Float64:
         """Matches in each cell (C,); a single comparison may not decide about one."""
         return np.minimum(np.bincount(cells, minlength=_ROWS * _COLUMNS), _MOST).astype(np.float64)
+
+
+def _with_neighbours(evidence: Float64) -> Float64:
+    """Evidence (C,) of each cell and a quarter of what the four cells beside it have: few things are one cell large."""
+    grid = np.pad(evidence.reshape(_ROWS, _COLUMNS), 1)
+    beside = grid[:-2, 1:-1] + grid[2:, 1:-1] + grid[1:-1, :-2] + grid[1:-1, 2:]
+    return np.asarray(grid[1:-1, 1:-1] + 0.25 * beside).ravel()

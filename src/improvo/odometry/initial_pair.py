@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from improvo.geometry.epipolar import rotation_residuals
 from improvo.geometry.ransac import Ransac, RobustHomography, homography, motions_of_homography, relative_pose
 from improvo.geometry.triangulation import triangulate_tracks
 from improvo.odometry.settings import OdometrySettings, StartSettings
+from improvo.odometry.two_motions import has_second_motion
 from improvo.odometry.view import View, matches_of_world, ransac_pairs
 from improvo.tracking.matching import match_units
 from improvo.types import Float64, Int64
@@ -67,6 +68,9 @@ def initial_pair(
         return InitFailure("too few matches agree on a motion")
     if np.median(rotation_residuals(camera, pixels_a[inliers], pixels_b[inliers])) < start.min_rotation_residual:
         return InitFailure("too little parallax: a rotation explains the motion")
+    another = replace(ransac, max_iterations=1000)
+    if has_second_motion(essential.pose, camera, pixels_a, pixels_b, another, start.max_second_motion):
+        return InitFailure("two motions: one of them is not the camera's")
     ratio = plane.inliers.sum() / max(inliers.sum(), 1)
     off_plane = (inliers & ~plane.inliers).sum()
     if ratio > start.max_homography_ratio and off_plane < start.min_off_plane_points:

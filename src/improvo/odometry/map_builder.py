@@ -47,9 +47,8 @@ class MapBuilder:
             nothing, none = np.zeros(0, np.int64), np.zeros(0)
             return SparseMap(nothing, np.zeros((0, 3)), nothing, none, none, nothing)
         parts = self._finished
-        return SparseMap(
-            **{name: np.concatenate([getattr(part, name) for part in parts]) for name in SparseMap.__dataclass_fields__}
-        )
+        names = [name for name in SparseMap.__dataclass_fields__ if name != "rgb"]
+        return SparseMap(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
     def copy(self) -> MapBuilder:
         """Another one in the same state."""

@@ -21,22 +21,26 @@ _FIELDS = (
     ("segment", "<i4", "int"),
 )
 
+_COLOURS = tuple((name, "u1", "uchar") for name in ("red", "green", "blue"))
 _PLY_TYPES = {"float": "<f4", "double": "<f8", "int": "<i4", "uint": "<u4", "uchar": "u1", "short": "<i2"}
 
 
 def write_map(path: Path, sparse_map: SparseMap, unit: str = "up to scale") -> None:
     """Binary PLY, one vertex per map point; `unit` of lengths goes into a comment."""
-    rows = np.zeros(len(sparse_map), np.dtype([(name, kind) for name, kind, _ in _FIELDS]))
+    fields = _FIELDS if sparse_map.rgb is None else (*_FIELDS, *_COLOURS)
+    rows = np.zeros(len(sparse_map), np.dtype([(name, kind) for name, kind, _ in fields]))
     rows["x"], rows["y"], rows["z"] = sparse_map.xyz.T
     rows["observations"], rows["mean_error"] = sparse_map.observations, sparse_map.mean_error
     rows["segment"] = sparse_map.segment
+    if sparse_map.rgb is not None:
+        rows["red"], rows["green"], rows["blue"] = sparse_map.rgb.T
     header = [
         "ply",
         "format binary_little_endian 1.0",
         f"comment improvo map, {unit.encode('ascii', 'replace').decode()}",
         f"element vertex {len(rows)}",
     ]
-    header += [f"property {kind} {name}" for name, _, kind in _FIELDS]
+    header += [f"property {kind} {name}" for name, _, kind in fields]
     with written_atomically(path) as temporary, temporary.open("wb") as file:
         file.write(("\n".join([*header, "end_header"]) + "\n").encode())
         file.write(rows.tobytes())
@@ -66,6 +70,8 @@ def read_map(path: Path) -> SparseMap:
         vertices = np.frombuffer(body, dtype, count)
         xyz = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
         mean_error = vertices["mean_error"].astype(np.float64)
+        coloured = all(name in (dtype.names or ()) for name, _, _ in _COLOURS)
+        rgb = np.stack([vertices[name] for name, _, _ in _COLOURS], axis=1).astype(np.uint8) if coloured else None
         return SparseMap(
             ids=np.arange(count),
             xyz=xyz,
@@ -73,6 +79,7 @@ def read_map(path: Path) -> SparseMap:
             mean_error=mean_error,
             max_error=np.full(count, np.nan),
             segment=vertices["segment"].astype(np.int64),
+            rgb=rgb,
         )
     except (ValueError, KeyError) as error:
         raise InputError(

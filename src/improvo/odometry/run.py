@@ -6,7 +6,7 @@ import platform
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -28,11 +28,14 @@ from improvo.geometry.trajectory_files import write_trajectory
 from improvo.jobs.interrupts import interrupts_wait
 from improvo.odometry.ahead import detected_ahead
 from improvo.odometry.map_file import write_map
+from improvo.odometry.point_colours import PointColours
 from improvo.odometry.recorder import TrackRecorder
 from improvo.odometry.run_settings import RunSettings
+from improvo.odometry.trajectory_builder import FinalView
 from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
 from improvo.odometry.visualizer import NullVisualizer, Visualizer
 from improvo.sequences import Sequence
+from improvo.terminal import counted
 from improvo.types import Trajectory
 
 _MIN_FRAMES = 3
@@ -90,13 +93,21 @@ def run_odometry(
     frontend = frontend or frontend_from(settings.frontend)
     visualizer = visualizer or NullVisualizer()
     if sequence.length is not None and sequence.length < _MIN_FRAMES:
-        raise InputError(f"{sequence.path}: has {sequence.length} frames; odometry needs at least {_MIN_FRAMES}")
+        raise InputError(
+            f"{sequence.path}: has {counted(sequence.length, 'frame')}; odometry needs at least {_MIN_FRAMES}"
+        )
     make_output_folder(folder, command)
     seconds: defaultdict[str, float] = defaultdict(float)
     started = time.perf_counter()
+    colours = PointColours()
     with TrackRecorder(folder, sequence.camera, settings.labels) as recorder:
+
+        def final(view: FinalView) -> None:
+            recorder.add(view)
+            colours.add(view)
+
         odometry = VisualOdometry(
-            frontend, sequence.camera, settings.odometry, settings.frontend.use_stability, on_final=recorder.add
+            frontend, sequence.camera, settings.odometry, settings.frontend.use_stability, on_final=final
         )
         visualizer.begin(sequence.camera)
         processed, interrupted = _track_all(sequence, frontend, odometry, visualizer, progress, seconds)
@@ -106,7 +117,9 @@ def run_odometry(
             raise InputError(f"{sequence.path}: only {len(processed)} of its frames can be read; check the recording")
     trajectory = odometry.trajectory
     write_trajectory(folder / "trajectory.txt", trajectory)
-    write_map(folder / "map.ply", odometry.map)
+    sparse_map = odometry.map
+    rgb = colours.read(sequence, processed, sparse_map.ids)
+    write_map(folder / "map.ply", replace(sparse_map, rgb=rgb))
     seconds["total"] = time.perf_counter() - started
     report = _report(sequence, settings, frontend, odometry, processed, interrupted, recorder.counts, seconds)
     write_json(folder / "run.json", report)
@@ -127,7 +140,7 @@ def _track_all(
         for detected in detected_ahead(sequence, partial(features_of, frontend), odometry.match):
             with interrupts_wait():
                 start = time.perf_counter()
-                tracked = odometry.track_matched(detected.matched, detected.frame.time)
+                tracked = odometry.track_matched(detected.matched, detected.frame.time, detected.frame.image)
                 seconds["track and adjust"] += time.perf_counter() - start
                 seconds["read"] += detected.reading
                 seconds["detect"] += detected.detecting
@@ -183,7 +196,14 @@ def _report(
             "lost_frames": np.flatnonzero(~has_pose).tolist(),
             "source_index": processed,
         },
-        "segments": [{**asdict(segment), "mean_error": _number(segment.mean_error)} for segment in odometry.segments],
+        "segments": [
+            {
+                **asdict(segment),
+                "mean_error": _number(segment.mean_error),
+                "verdict": segment.verdict.report(),
+            }
+            for segment in odometry.segments
+        ],
         "events": [asdict(event) for event in odometry.events],
         "points": len(odometry.map),
         "tracks": dict(tracks),

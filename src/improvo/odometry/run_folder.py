@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +19,8 @@ from improvo.geometry.camera import Camera
 from improvo.geometry.trajectory_files import read_trajectory
 from improvo.odometry.map_file import read_map
 from improvo.odometry.run import unit_of
+from improvo.odometry.told_verdicts import doubtful_frames, uncertain_frames
+from improvo.odometry.view import Mask
 from improvo.sequences import Sequence, SequenceSettings, open_sequence
 from improvo.stability.rule import IGNORE
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
@@ -120,6 +122,16 @@ class RunFolder:
         return frame_indices
 
     @cached_property
+    def doubtful(self) -> Mask:
+        """(N,) whether the verdict of the segment is doubtful, for each row of `trajectory`."""
+        return doubtful_frames(self.report, self.trajectory.segment)
+
+    @cached_property
+    def uncertain(self) -> Mask:
+        """(N,) whether the scale is not determined there, for each row of `trajectory`."""
+        return uncertain_frames(self.report, self.frame_indices)
+
+    @cached_property
     def map(self) -> SparseMap:
         """The map points."""
         return read_map(self.path / "map.ply")
@@ -138,6 +150,9 @@ class RunFolder:
     def sequence(self) -> Sequence:
         """The recording, opened as it was for the run."""
         settings = config.from_dict(SequenceSettings, self.report["configuration"]["sequence"], "run.json")
+        own = self.path / "camera.yaml"  # found for this run (`--camera auto`), which may have been moved
+        if settings.camera is not None and own.is_file() and Path(settings.camera).name == own.name:
+            settings = replace(settings, camera=str(own))
         path = self._sequence_path or self._recorded_input
         if not path.exists():
             raise InputError(f"{path}: the recording is not there any more; name it with --sequence PATH")

@@ -33,6 +33,11 @@ class SlidingWindow:
         return self.recent[-1]
 
     @property
+    def keyframes(self) -> list[View]:
+        """Older keyframes, in temporal order; their observations still count."""
+        return list(self._keyframes)
+
+    @property
     def free(self) -> list[View]:
         """Views whose poses are adjusted, in temporal order."""
         return [*self._keyframes[-self._settings.keyframes :], *self.recent]
@@ -88,6 +93,8 @@ class SlidingWindow:
                 final.extend(_with_non_keyframes(keyframe))
                 keyframe.final, keyframe.non_keyframes = True, []
         del self._keyframes[: -(self._settings.keyframes + self._settings.fixed)]
+        for view, _ in final:
+            view.image = None
         return final
 
     def remaining(self) -> Iterator[tuple[View, Float64]]:

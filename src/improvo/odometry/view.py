@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from improvo.odometry.settings import RansacGateSettings
-from improvo.types import Float32, Float64, Int64
+from improvo.types import Float32, Float64, Int64, UInt8
 
 NO_POINT = -1
 Mask = NDArray[np.bool_]
@@ -26,6 +26,7 @@ class View:
     tracks: Int64  # (N,) connect-the-dots track of each keypoint
     points: Int64  # (N,) map point of each keypoint, or NO_POINT
     attached: Mask = field(default_factory=lambda: np.zeros(0, bool))  # (N,) moves with the camera: makes no map
+    image: UInt8 | None = None  # (H, W) grey, until the view is final; None where keypoints are not refined
     cam_from_world: Float64 | None = None  # (4, 4)
     segment: int = -1  # number of the segment that the pose belongs to; -1 without a pose
     world: int = 0  # number of the map that the pose belongs to; it changes where a segment is started anew, too
@@ -35,6 +36,8 @@ class View:
     non_keyframes: list[tuple[View, Float64]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        self.detected = self.keypoints.copy()  # (N, 2) pixels, before any refinement (`keypoint_refinement.py`)
+        self.refined = np.zeros(len(self.keypoints), bool)
         if len(self.attached) != len(self.keypoints):
             self.attached = np.zeros(len(self.keypoints), bool)
 
@@ -48,6 +51,7 @@ class View:
         self.cam_from_world = None
         self.segment = -1
         self.points[:] = NO_POINT
+        self.keypoints[:], self.refined[:] = self.detected, False
         self.keyframe, self.non_keyframes = False, []
 
     def __len__(self) -> int:

@@ -13,10 +13,12 @@ from improvo.files import written_atomically
 from improvo.odometry.run_folder import RunFolder
 from improvo.report.overhead import overhead_axes, robust_limits
 from improvo.report.palettes import PALETTES, Palette
-from improvo.types import SparseMap
+from improvo.types import SparseMap, UInt8
 
 _BACKGROUND = "#565b63"  # neither the paper's black (last window) nor its white (points)
+_DOUBTED = "#ff4fd8"  # a band under the path, which no ramp of the palettes has
 LAST_POSES = 30  # N_last
+_DARKEST = 70  # grey level in which black points are drawn
 
 
 def draw_map(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"], last_poses: int = LAST_POSES) -> None:
@@ -32,7 +34,7 @@ def draw_map(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"], l
 
 
 def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: int = LAST_POSES) -> bytes:
-    """A PNG: points white, the trajectory from blue to red over time, the last window black.
+    """A PNG: points in their own colours, the trajectory from blue to red over time, the last window black.
 
     Raises:
         InputError: no frame of the run has a pose.
@@ -60,7 +62,7 @@ def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: in
         points_2d[inside, 0],
         points_2d[inside, 1],
         s=size,
-        c="white",
+        c=map_colours(run.map)[shown][inside] / 255.0,
         alpha=alpha,
         linewidths=0,
         zorder=1,
@@ -75,6 +77,10 @@ def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: in
     )
     axis.add_collection(
         LineCollection(list(links[~joined]), colors="white", linewidths=1.0, linestyles="dotted", zorder=2)
+    )
+    doubted = (run.doubtful | run.uncertain)[1:] & joined
+    axis.add_collection(
+        LineCollection(list(links[doubted]), colors=_DOUBTED, linewidths=8.0, capstyle="round", alpha=0.8, zorder=2)
     )
     last = path_2d[-last_poses:]
     axis.plot(*last.T, color="white", linewidth=5.5, solid_capstyle="round", zorder=4)
@@ -108,6 +114,13 @@ def trusted_points(sparse_map: SparseMap) -> NDArray[np.intp]:
     return np.flatnonzero(good)
 
 
+def map_colours(sparse_map: SparseMap) -> UInt8:
+    """RGB (P, 3) of the points as the recording shows them, not so dark that they are lost; white where not known."""
+    if sparse_map.rgb is None:
+        return np.full((len(sparse_map), 3), 235, np.uint8)
+    return np.rint(_DARKEST + (255 - _DARKEST) / 255.0 * sparse_map.rgb).astype(np.uint8)
+
+
 def _title(run: RunFolder, points: int, outside: int) -> str:
     frames, segments = run.report["frames"], run.report["segments"]
     parts = [
@@ -116,6 +129,8 @@ def _title(run: RunFolder, points: int, outside: int) -> str:
     ]
     if outside:
         parts.append(f"{outside} far ones outside the picture")
+    if (run.doubtful | run.uncertain).any():
+        parts.append("doubtful where the band is pink")
     if len(segments) > 1:
         own = "" if run.unit.startswith("metres") else "each with its own scale, "
         parts.append(f"{len(segments)} segments, {own}placed by guess")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.odometry.run_folder import RunFolder
-from improvo.report.map_picture import LAST_POSES, trusted_points
+from improvo.report.map_picture import LAST_POSES, map_colours, trusted_points
 from improvo.report.overhead import overhead_axes, robust_limits
 from improvo.report.palettes import Palette
 from improvo.stability.rule import IGNORE
@@ -45,12 +45,13 @@ def scene_data(run: RunFolder, palette: Palette) -> dict[str, Any]:
     poses = np.concatenate([centres[:, None], rotated], axis=1).reshape(-1)
     return {
         "layers": {
-            "map": _layer(map_points, np.full((len(map_points), 3), 235, np.uint8)),
+            "map": _layer(map_points, map_colours(run.map)[map_rows]),
             "labels": _layer(label_points, palette.label_colours(run.points.stability[label_rows])),
         },
         "poses": _base64(poses.astype("<f4")),
         "frame_indices": run.frame_indices.tolist(),
         "segments": trajectory.segment.tolist(),
+        "doubted": (run.doubtful | run.uncertain).tolist(),
         "frames": run.frames,
         "last": min(LAST_POSES, max(len(trajectory) - 1, 0)),
         "centre": centre,

@@ -18,6 +18,7 @@ from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.odometry.run_folder import RunFolder
 from improvo.odometry.view import View
+from improvo.report.map_picture import map_colours
 from improvo.report.palettes import PALETTES, Palette
 from improvo.stability.rule import IGNORE
 from improvo.types import Float64, Frame, UInt8
@@ -106,7 +107,7 @@ def show_run(
     recording.points(
         run.points.xyz[labelled], palette.label_colours(run.points.stability[labelled]), "world/labels", static=True
     )
-    recording.points(run.map.xyz, np.full((len(run.map), 3), 200, np.uint8), static=True)
+    recording.points(run.map.xyz, map_colours(run.map), static=True)
     recording.trajectory(run.trajectory.camera_centers, palette, static=True)
     for frame in range(run.frames):
         row = row_of_frame.get(frame)

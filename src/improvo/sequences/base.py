@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
-
-import numpy as np
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration
@@ -24,7 +22,7 @@ class SequenceSettings:
     """How a recording is read."""
 
     format: str = "auto"
-    camera: str | None = None  # a calibration file, or "fx,fy,cx,cy[,k1,k2,p1,p2,k3]"
+    camera: str | None = None  # a calibration file, "fx,fy,cx,cy[,k1,k2,p1,p2,k3]", or auto: from the video itself
     fov: float | None = None  # horizontal field of view in degrees, if there is no calibration
     fps: float | None = None  # frame rate of recordings without time stamps
     start: int = 0  # first frame of the recording
@@ -95,18 +93,6 @@ class Recording(ABC):
     def depth(self, index: int) -> Float32 | None:
         """Depth in metres (H, W) registered to the raw image, NaN where missing; None where there is none."""
         return None
-
-
-def sampled_pictures(recording: Recording, samples: int) -> Iterator[tuple[str, UInt8]]:
-    """Source and grey picture (H, W) of up to `samples` frames that can be read, spread over the recording."""
-    from improvo.sequences.images import grey
-
-    rows = np.unique(np.linspace(0, len(recording) - 1, min(samples, len(recording))).astype(int))
-    for row in rows.tolist():
-        try:
-            yield recording.source(row), grey(recording.image(row))
-        except UnreadableFrameError:  # noqa: PERF203 - any frame may be damaged
-            continue
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ class IclNuim(Recording):
         self.times = np.array(self._numbers, np.float64) / rate
         published = Calibration("ICL-NUIM", (481.2, 480.0, 319.5, 239.5), size=(640, 480))
         self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: published)
-        self._scale = depth_scale(self.calibration, settings) or DEPTH_SCALE
+        self._scale = depth_scale(self.calibration, settings, path) or DEPTH_SCALE
         truth = next(iter(sorted(path.glob("*.gt.freiburg"))), None)
         if truth is not None:
             poses_up, problems = read_trajectory_report(truth, "tum")

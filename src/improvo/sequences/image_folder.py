@@ -61,7 +61,7 @@ class ImageFolder(Recording):
             files, (self.times, unit) = [files[row] for row in order], in_seconds(stamps[order])
             notes.append(f"{path}: the names of the files are taken as time stamps in {unit or 'seconds'}")
         else:
-            rate, note = frame_rate(self.calibration, settings)
+            rate, note = frame_rate(self.calibration, settings, path)
             self.times = _frame_numbers(files) / rate
             if note is not None and truth is not None and len(truth) == len(files) and has_times(truth_file):
                 self.times, note = truth.times, f"has no time stamps; those of {truth_file.name} are taken, row by row"

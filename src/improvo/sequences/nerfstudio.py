@@ -57,7 +57,7 @@ class Nerfstudio(Recording):
         if self._size is not None:
             content = {**content, "w": self._size[0], "h": self._size[1]}
         self.calibration = self.own_calibration(lambda: _calibration(str(file), content, frames, notes))
-        rate, note = frame_rate(None, settings)
+        rate, note = frame_rate(None, settings, path)
         notes += [f"{path}: {note}"] if note else []
         self.times = np.arange(len(frames)) / rate
         poses = np.stack([numbers(frame.get("transform_matrix"), 16).reshape(4, 4) for frame in frames])

@@ -63,7 +63,7 @@ class ScanNetFolder(Recording):
         if self.calibration is not None:
             self.calibration_error = None
         given = settings.fps or settings.camera or (self.calibration and self.calibration.fps)
-        self.times = (numbers - numbers[0]) / (frame_rate(self.calibration, settings)[0] if given else FPS)
+        self.times = (numbers - numbers[0]) / (frame_rate(self.calibration, settings, path)[0] if given else FPS)
         if len(self.times) > 1 and not (np.diff(self.times) > 0).all():
             raise InputError(f"{path}: two images have the same number; remove one")
         matrices = np.stack([read_matrix(file) for file in poses_files])

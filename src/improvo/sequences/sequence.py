@@ -11,11 +11,12 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
-from improvo.geometry.camera_files import Calibration, from_field_of_view, load_calibration
+from improvo.geometry.camera_files import Calibration, from_field_of_view
 from improvo.sequences.association import poses_at
 from improvo.sequences.base import Recording, SequenceSettings, SkippedFrame, UnreadableFrameError
 from improvo.sequences.images import grey
 from improvo.sequences.mask import SequenceMasks
+from improvo.sequences.rates import AUTO, given_calibration, recording_name
 from improvo.sequences.rectification import Rectifier
 from improvo.types import Float32, Float64, Frame, Int64, Mask, Trajectory, UInt8
 
@@ -44,7 +45,7 @@ class Sequence:
         self.settings = settings
         self.path: Path = recording.path
         self.format = recording.format
-        self.name = _name(recording.path)
+        self.name = recording_name(recording.path)
         self._skipped: dict[int, SkippedFrame] = {}
         self._raw_size = (width, height)
         if settings.width is not None and settings.width < 8:
@@ -219,8 +220,14 @@ def selected(recording: Recording, settings: SequenceSettings) -> Int64:
 
 def _calibration(recording: Recording, settings: SequenceSettings, width: int, height: int) -> Calibration:
     """The user's calibration, else the recording's, else one from the field of view."""
-    if settings.camera is not None:
-        return load_calibration(settings.camera)
+    if settings.camera == AUTO:
+        raise InputError(
+            f"{recording.path}: `{AUTO}` is a camera that commands look for before they open the recording; here, give "
+            "the file that `improvo calibrate` or `improvo.find_camera` writes"
+        )
+    given = given_calibration(settings, recording.path)
+    if given is not None:
+        return given
     if settings.fov is not None:
         return from_field_of_view(settings.fov, width, height)
     if recording.calibration_error is not None:
@@ -228,7 +235,8 @@ def _calibration(recording: Recording, settings: SequenceSettings, width: int, h
     if recording.calibration is None:
         raise InputError(
             f"{recording.path}: has no calibration; give --camera FILE.yaml or fx,fy,cx,cy[,k1,k2,p1,p2,k3], "
-            f"or roughly --fov DEGREES (horizontal; 60 to 75 for most phones and webcams)"
+            "or roughly --fov DEGREES (horizontal; 60 to 75 for most phones and webcams), or find it from the "
+            f"motion with --camera {AUTO}"
         )
     return recording.calibration
 
@@ -236,9 +244,3 @@ def _calibration(recording: Recording, settings: SequenceSettings, width: int, h
 def _first_part(error: InputError) -> str:
     """What is wrong, without the advice."""
     return str(error).split(";")[0]
-
-
-def _name(path: Path) -> str:
-    """A short name for titles and folders: the file's stem or the folder's name."""
-    name = path.stem if path.is_file() else path.absolute().name
-    return name or str(path)

@@ -47,8 +47,8 @@ class SevenScenes(Recording):
             notes.append(f"{path}: has no camera.yaml; a Kinect's usual focal length of 525 px assumed")
             if has_depth:
                 notes.append(f"{path}: original 7-Scenes depth is not registered to colour: do not trust it at edges")
-        self._scale = depth_scale(self.calibration, settings) or DEPTH_SCALE
-        rate, assumed = frame_rate(self.calibration, settings)
+        self._scale = depth_scale(self.calibration, settings, path) or DEPTH_SCALE
+        rate, assumed = frame_rate(self.calibration, settings, path)
         rate = FPS if assumed else rate
         self.times = (np.array(self._numbers, np.float64) - self._numbers[0]) / rate
         self.ground_truth, problems = self._read_poses()

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from improvo.errors import InputError
-from improvo.geometry.camera_files import load_calibration
 from improvo.sequences.base import SequenceSettings
 from improvo.sequences.live import LiveStream
 from improvo.sequences.opening import open_recording
+from improvo.sequences.rates import given_calibration
 from improvo.sequences.sequence import Sequence
 from improvo.sequences.survey_judgement import Problem, camera_problems, picture_problems
 from improvo.sequences.survey_pictures import measure
@@ -52,8 +52,7 @@ def survey(
     if isinstance(recording, LiveStream):
         recording.close()
         raise InputError(f"{path}: is live, so there is nothing to look at yet; record it first")
-    if settings.camera is not None:
-        load_calibration(settings.camera)  # a calibration given by the user must be correct
+    given_calibration(settings, recording.path)  # a calibration given by the user must be correct
     problems: list[Problem] = []
     calibrated = True
     try:
@@ -64,7 +63,11 @@ def survey(
         except InputError:
             raise error from None
         calibrated = False
-        problems.append(Problem(str(error), "`improvo calibrate VIDEO_OF_A_BOARD` makes a camera.yaml in a minute"))
+        problems.append(
+            Problem(
+                str(error), "`improvo calibrate VIDEO` finds the camera from the motion, or more exactly with `--board`"
+            )
+        )
     measured = measure(sequence, samples, progress)
     facts: dict[str, Any] = {
         "name": sequence.name,

@@ -42,7 +42,7 @@ class TumRgbd(Recording):
         pairs = None if (path / "rgb.txt").is_file() else _pairs_file(path)
         self.times, files, notes = _read_list(pairs or path / "rgb.txt", "rgb")
         self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: _published(path))
-        self._scale = depth_scale(self.calibration, settings) or DEPTH_SCALE
+        self._scale = depth_scale(self.calibration, settings, path) or DEPTH_SCALE
         self._depth: list[Path] = []
         self._depth_row = np.full(len(self.times), -1, np.int64)
         if pairs is not None or (path / "depth.txt").is_file():

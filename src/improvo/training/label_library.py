@@ -93,7 +93,7 @@ class LabelLibrary(Sequence[LabeledFrames]):
         process = Process.current()
         # processes that train together begin in different places, and find what others have made meanwhile
         first = process.rank * len(missing) // process.world_size
-        tasks = [(self._files, replace(self._sequences[row])) for row in missing[first:] + missing[:first]]
+        tasks = [(self._files, self._sequences[row]) for row in missing[first:] + missing[:first]]
         count = max(min(workers, len(tasks) // _ENOUGH_FOR_PROCESSES), 1)
         with Workers(count, progress and process.leads) as pool:
             made = pool.run(_made, tasks, "preparing labels")
@@ -103,4 +103,4 @@ class LabelLibrary(Sequence[LabeledFrames]):
 
 def _made(task: tuple[LandmarkFiles, LabeledSequence]) -> Summary:
     files, sequence = task
-    return files.summary(sequence) or files.make(sequence)[1]
+    return files.summary(sequence) or files.make(replace(sequence))[1]  # the tables that it reads are dropped

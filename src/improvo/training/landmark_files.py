@@ -20,6 +20,7 @@ from improvo.errors import OutputError
 from improvo.files import written_atomically
 from improvo.geometry.camera import Camera
 from improvo.labeling.labeled import LabeledSequence
+from improvo.locations import size_of
 from improvo.stability.rule import STABILITY_NAMES
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE
 from improvo.training.landmarks import Landmarks, Summary, find_landmarks
@@ -100,7 +101,7 @@ class LandmarkFiles:
     @staticmethod
     def _labels(sequence: LabeledSequence) -> str:
         """Which labels these are: their record, and how large their tables are."""
-        sizes = [(sequence.folder / name).stat().st_size for name in (POINTS_FILE, TRACKS_FILE)]
+        sizes = [size_of(sequence.folder / name) for name in (POINTS_FILE, TRACKS_FILE)]
         return _digest([config.to_dict(sequence.record), config.to_dict(sequence.rule), sizes])
 
 

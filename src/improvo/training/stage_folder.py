@@ -19,8 +19,9 @@ from improvo.frontend.architecture import Architecture
 from improvo.frontend.channel_pruning import with_dead_channels
 from improvo.frontend.weights import DataSource, ModelCard, load_weights, save_weights
 from improvo.training.distributed import Process
+from improvo.training.held_settings import HeldSettings
 from improvo.training.metrics import METRICS, read_metrics
-from improvo.training.settings import HeldSettings, HomographiesSettings, OdometryTrainingSettings, ShapesSettings
+from improvo.training.settings import HomographiesSettings, OdometryTrainingSettings, ShapesSettings
 from improvo.training.stage import Stage
 from improvo.training.trainer import Batches, Trainer
 

@@ -112,7 +112,8 @@ def _in_folder(folder: Path) -> Path:
             if (place / name).is_file():
                 return place / name
     raise InputError(
-        f"--camera {folder}: is a folder without cameras.bin, cameras.txt or camera.yaml; give the calibration file"
+        f"--camera {folder}: is a folder without cameras.bin, cameras.txt, camera.yaml or a file with the name of the "
+        "recording (NAME.yaml); give the calibration file"
     )
 
 

@@ -71,7 +71,7 @@
   function drawPath(project, scale) {
     context.lineCap = "round";
     const lastOnes = count - 1 - data.last;
-    for (const [wide, colourOf] of [[5, (i) => (i > lastOnes ? "#fff" : null)], [3, (i) =>
+    for (const [wide, colourOf] of [[9, (i) => (data.doubted[i] ? "#ff4fd8" : null)], [5, (i) => (i > lastOnes ? "#fff" : null)], [3, (i) =>
       (i > lastOnes ? "#000" : ramp(data.frame_indices[i] / Math.max(1, data.frames - 1)))]]) {
       for (let i = 1; i < count; i++) {
         const colour = colourOf(i);
@@ -143,6 +143,7 @@
 
   const fingers = new Map();
   canvas.addEventListener("pointerdown", (event) => {
+    canvas.focus({ preventScroll: true });
     canvas.setPointerCapture(event.pointerId);
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
   });
@@ -163,6 +164,7 @@
     canvas.addEventListener(kind, (event) => fingers.delete(event.pointerId));
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("wheel", (event) => {
+    if (document.activeElement !== canvas) return; // the page scrolls until the map is clicked
     event.preventDefault();
     zoom(Math.exp(0.0012 * event.deltaY));
   }, { passive: false });
