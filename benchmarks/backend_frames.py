@@ -13,8 +13,8 @@ from improvo.backend import BundleProblem, BundleResult, SolverSettings, solve
 from improvo.geometry import se3
 from improvo.geometry.alignment import align_points
 from improvo.geometry.camera import Camera
+from improvo.geometry.ransac import Ransac, absolute_pose
 from improvo.geometry.triangulation import triangulate_tracks
-from improvo.geometry.two_view import Ransac, absolute_pose
 from improvo.types import Float64, Int64
 
 WINDOW = 30  # poses that are optimised (paper, N_last)

@@ -6,7 +6,8 @@
 Each row: frames with a pose, segments, ATE after Sim3 per segment as % of the true path, relative errors over 2 s,
 milliseconds per frame of the frontend and of everything else (one thread each; `improvo run` overlaps the two), and
 whether the run is silently wrong: a segment with over 5 % of ATE and no alarm of the two-view check. Where a folder has
-`truth-sfm.txt`, that is the truth (--own-truth: not); the odometry keeps the recording's own camera.
+`truth-sfm.txt`, that is the truth (--own-truth: not); the odometry keeps the recording's own camera. `--solver opencv`
+is what runs where PoseLib is not installed.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -30,9 +32,10 @@ from improvo.evaluation.settings import TrajectorySettings
 from improvo.evaluation.trajectory.protocol import evaluate_trajectory
 from improvo.evaluation.truth.referenced import open_with_truth
 from improvo.frontend.registry import load_frontend
+from improvo.geometry.ransac import robust_solver
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.visual_odometry import VisualOdometry
-from improvo.sequences import SequenceSettings, open_sequence
+from improvo.sequences import Sequence, SequenceSettings, open_sequence
 from improvo.types import Features, Trajectory
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -49,6 +52,7 @@ class Row:
     sequence: str
     frontend: str
     mode: str
+    solver: str
     seed: int
     frames: int
     poses: int
@@ -67,6 +71,9 @@ def main() -> None:
     """Run and print the table."""
     arguments = parse()
     cv2.setNumThreads(1)
+    if arguments.solver == "opencv":
+        sys.modules["poselib"] = None  # type: ignore[assignment]
+    assert robust_solver().name == arguments.solver
     compile_kernels(print)
     rows: list[Row] = []
     print(HEADER)
@@ -104,15 +111,15 @@ def runs(
             settings = OdometrySettings(mode=mode, seed=seed)
             start = time.perf_counter()
             odometry = VisualOdometry(frontend, sequence.camera, settings)
-            track(odometry, detected)
+            track(odometry, detected, sequence)
             odometry_ms = 1e3 * (time.perf_counter() - start) / len(detected)
             yield measured(folder.name, frontend_name, mode, seed, odometry, truth, frontend_ms, odometry_ms)
 
 
-def track(odometry: VisualOdometry, detected: list[tuple[float, Features]]) -> None:
+def track(odometry: VisualOdometry, detected: list[tuple[float, Features]], sequence: Sequence) -> None:
     """The whole sequence."""
-    for seconds, features in detected:
-        odometry.track_features(features, seconds)
+    for (seconds, features), frame in zip(detected, sequence, strict=True):
+        odometry.track_features(features, seconds, frame.image)
     odometry.finish()
 
 
@@ -142,6 +149,7 @@ def measured(
         sequence=sequence,
         frontend=frontend,
         mode=mode,
+        solver=robust_solver().name,
         seed=seed,
         frames=len(estimate),
         poses=int(estimate.valid.sum()),
@@ -158,8 +166,8 @@ def measured(
 
 
 HEADER = (
-    "| sequence | frontend | mode | seed | poses | segments | ATE % | worst segment % | rot 2 s ° | trans 2 s % "
-    "| frontend ms | odometry ms | alarms |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|"
+    "| sequence | frontend | mode | solver | seed | poses | segments | ATE % | worst segment % | rot 2 s ° "
+    "| trans 2 s % | frontend ms | odometry ms | alarms |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
 
 
@@ -174,6 +182,7 @@ def formatted(row: Row) -> str:
         row.sequence,
         row.frontend,
         row.mode,
+        row.solver,
         str(row.seed),
         f"{row.poses}/{row.frames}",
         str(row.segments),
@@ -200,6 +209,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--sequence", nargs="+", default=list(SEQUENCES))
     parser.add_argument("--frontend", nargs="+", default=list(FRONTENDS))
     parser.add_argument("--mode", nargs="+", default=["robust", "paper"], choices=("robust", "paper"))
+    parser.add_argument("--solver", default="poselib", choices=("poselib", "opencv"), help="of poses from matches")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--max-keypoints", type=int, default=1000)
     parser.add_argument("--own-truth", action="store_true", help=f"also where there is a {BETTER_TRUTH}")

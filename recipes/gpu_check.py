@@ -22,11 +22,11 @@ from improvo.frontend.superpoint import heat_map
 from improvo.frontend.weights import find_weights, load_weights
 from improvo.training.device_pairs import DevicePairs
 from improvo.training.held import HeldStage
-from improvo.training.held_training import network_teacher
+from improvo.training.held_settings import HeldSettings
 from improvo.training.metrics import METRICS, read_metrics
 from improvo.training.pack import read_pack
 from improvo.training.pictures import Pictures
-from improvo.training.settings import HeldSettings
+from improvo.training.teacher import network_teacher
 from improvo.training.trainer import Trainer, choose_device
 
 # largest difference of a heat map, and of 1 - cosine of a descriptor (99th percentile), from the CPU in float32

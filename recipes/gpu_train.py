@@ -22,8 +22,8 @@ import yaml
 from improvo import files
 from improvo.config import from_dict, over
 from improvo.frontend.weights import find_weights
+from improvo.training.held_settings import HeldSettings
 from improvo.training.metrics import METRICS, read_metrics
-from improvo.training.settings import HeldSettings
 
 HERE = Path(__file__).parent
 WEIGHTS = "weights.safetensors"

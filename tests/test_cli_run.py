@@ -92,7 +92,7 @@ def test_printed_settings_can_be_given_back(walk: Path, tmp_path: Path, capsys: 
     config = tmp_path / "config.yaml"
     config.write_text(capsys.readouterr().out)
     out = tmp_path / "out"
-    assert main(["run", str(walk), "-o", str(out), "--config", str(config), "--max-frames", "5"]) == 0
+    assert main(["run", str(walk), "-o", str(out), "--config", str(config), "--max-frames", "5"]) == 3
     configuration = json.loads((out / "run.json").read_text())["configuration"]
     assert configuration["frontend"]["name"] == "orb"
     assert configuration["frontend"]["max_keypoints"] == 300

@@ -8,6 +8,7 @@ import functools
 import io
 import json
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -108,7 +109,9 @@ def test_comments_of_fields_are_their_help() -> None:
     assert found["precision"] == "auto | float32 | bfloat16"
 
 
-@pytest.mark.parametrize("words", [words for words in ALL if words not in (("demo",), ("config",))], ids=" ".join)
+@pytest.mark.parametrize(
+    "words", [words for words in ALL if words not in (("demo",), ("config",), ("completion",))], ids=" ".join
+)
 def test_nothing_is_made_where_the_input_is_missing(
     words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -126,6 +129,8 @@ def test_nothing_is_made_where_the_input_is_missing(
         output = []
     if words == ("weights", "show"):
         output = []
+    if words in (("export", "features"), ("weights", "export")):
+        output += ["--layout", "hloc" if words[0] == "export" else "original"]
     if words == ("simulate",):
         output += ["--size", "huge"]
     if words[:1] == ("train",):
@@ -169,13 +174,15 @@ def test_progress_is_a_line_now_and_then_where_there_is_no_terminal(
 ) -> None:
     monkeypatch.setattr(terminal, "INTERVAL", 0.0)
     with terminal.progress("label", "frame", 4) as shown:
-        shown.advance(3)
+        shown.advance()  # the time until here is that of loading, and tells nothing
+        shown.advance(2)
         shown.note("no pose yet")
         shown.advance()
     lines = capsys.readouterr().err.splitlines()
-    assert lines[0].startswith("label: 3 of 4 frames (75 %), ")
-    assert lines[0].endswith("left")
-    assert lines[1].endswith("; no pose yet")
+    assert lines[0] == "label: 1 of 4 frames (25 %)"
+    assert lines[1].startswith("label: 3 of 4 frames (75 %), ")
+    assert lines[1].endswith("left")
+    assert lines[2].endswith("; no pose yet")
     with terminal.quiet(), terminal.progress("label", "frame", 4) as shown:
         shown.advance(4)
     assert capsys.readouterr().err == ""
@@ -191,3 +198,70 @@ def test_settings_of_a_network_reach_the_run(tmp_path: Path, capsys: pytest.Capt
     assert config.from_dict(DenseRunSettings, configuration).frontend.network.threads == 1
     assert main([*words, "--frontend", "orb", "--precision", "float32"]) == 2
     assert "not a network" in capsys.readouterr().err
+
+
+def test_a_run_without_any_pose_says_so_and_ends_with_status_3(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["run", str(bundled_sequence()), "-o", str(tmp_path / "out"), "--frontend", "orb", "--max-frames", "3"]
+    assert main(words) == 3
+    *_, why, last = capsys.readouterr().out.splitlines()
+    assert why.startswith("no frame has a pose: ")
+    assert last.startswith("next: `improvo info ")
+    assert (tmp_path / "out" / "run.json").is_file()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["run", "demo", "--frontend"], ["label", "demo", "--frontend"], ["improve", "demo", "--frontend"]],
+    ids=lambda words: words[0],
+)
+def test_an_unknown_frontend_is_refused_before_any_work(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "demo").write_text("no video at all")  # what is wrong with the recording would be found later
+    for name, message in (("nobody", "unknown; choose among"), ("absent.safetensors", "no such weights file")):
+        assert main([*words, name, "-o", "out"]) == 2
+        shown = capsys.readouterr()
+        assert message in shown.err
+        assert len(shown.err.splitlines()) == 1
+        assert shown.out == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["demo"]
+
+
+def test_one_is_singular() -> None:
+    assert [terminal.counted(count, "frame") for count in (0, 1, 2)] == ["0 frames", "1 frame", "2 frames"]
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_scripts_know_every_command(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("shtab", reason="needs shtab: pip install 'improvo[completion]'")
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    for words, _ in leaves():
+        assert all(word in script for word in words), words
+    assert "loop" in script
+
+
+def test_bash_completes_commands_options_and_choices(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("shtab", reason="needs shtab: pip install 'improvo[completion]'")
+    bash = shutil.which("bash")
+    if bash is None:
+        pytest.skip("needs bash")
+    assert main(["completion", "bash"]) == 0
+    script = tmp_path / "improvo.bash"
+    script.write_text(capsys.readouterr().out)
+    for line, expected in (
+        (["improvo", "evalu"], "evaluate"),
+        (["improvo", "export", "feat"], "features"),
+        (["improvo", "run", "x", "--front"], "--frontend"),
+        (["improvo", "weights", "export", "superpoint", "--layout", ""], "original"),
+    ):
+        words = " ".join(f"'{word}'" for word in line)
+        program = (
+            f"source {script}; COMP_WORDS=({words}); COMP_CWORD={len(line) - 1}; "
+            "$(complete -p improvo | sed 's/.*-F \\([^ ]*\\).*/\\1/'); echo \"${COMPREPLY[@]}\""
+        )
+        found = subprocess.run([bash, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+        assert expected in found, (line, found)

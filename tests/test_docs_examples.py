@@ -60,11 +60,16 @@ def label_store(place: Path) -> dict[str, Any]:
 
 
 def exported_model(place: Path) -> dict[str, Any]:
+    if (place / "run").exists():
+        return {}
+    pytest.importorskip("onnx", reason="needs onnx: pip install 'improvo[dev]'")
     pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'improvo[dev]'")
     from improvo.cli.main import main
 
     assert main(["run", str(bundled_sequence()), "-o", str(place / "run"), "--frontend", "orb"]) == 0
     assert main(["export", "colmap", str(place / "run"), "-o", str(place / "scene"), "--no-images"]) == 0
+    target = ["--max-keypoints", "500", "-o", str(place / "opencv.onnx")]
+    assert main(["export", "onnx", "superpoint-small", "--layout", "opencv", *target]) == 0
     return {}
 
 

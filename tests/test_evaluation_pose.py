@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,12 @@ from improvo.evaluation.pose.run import run_pose_protocol
 from improvo.evaluation.pose.tables import pose_tables
 from improvo.evaluation.settings import PoseSettings
 from improvo.evaluation.statistics import Bootstrap, accuracy_curve, area_shares, below
+from improvo.geometry.camera import Camera
 from improvo.geometry.depth_sampling import depth_at
 from improvo.geometry.se3 import inverse, rigid, so3_exp
 from improvo.jobs.pool import Workers
+from improvo.sequences import open_sequence
+from improvo.simulation import bundled_sequence
 
 SETTINGS = PoseSettings(gaps=(3, 8), pairs=6, resamples=200)
 
@@ -368,3 +372,41 @@ def test_bad_sequences_on_the_command_line_exit_2(
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert error.startswith("improvo: ")
     assert name in error
+
+
+def test_gaps_are_asked_in_seconds_or_by_overlap(tmp_path, capsys) -> None:
+    from improvo.evaluation.pose.gaps import gaps_of_seconds, overlap, widest_gaps
+
+    sequence = open_sequence(bundled_sequence())  # 30 a second
+    assert gaps_of_seconds(sequence, (0.5, 1.0, 2.0)) == (15, 30, 60)
+    with pytest.raises(ConfigError, match="choose others"):
+        gaps_of_seconds(sequence, (0.01, 0.02))
+    assert widest_gaps(lambda gap: 1 - 0.1 * gap, 50, (0.75, 0.55)) == (2, 4)  # the last before it falls below
+    assert widest_gaps(lambda gap: 0.1, 50, (0.75, 0.55, 0.3)) == (1,)
+    assert widest_gaps(lambda gap: 0.9, 5, (0.75,)) == ()
+    camera = Camera(80, 60, 100.0, 100.0, 39.5, 29.5)
+    sideways = np.eye(4)
+    sideways[0, 3] = 0.4  # of a plane 1 m away: 40 of 80 pixels
+    assert overlap(camera, np.ones((60, 80), np.float32), sideways) == pytest.approx(0.5, abs=0.06)
+    assert overlap(camera, np.full((60, 80), np.nan, np.float32), np.eye(4)) == 0
+
+    words = ["evaluate", "pose", str(bundled_sequence()), "--frontend", "orb", "--pairs", "2", "--workers", "1"]
+    words.append("--json")
+    assert main([*words, "--gaps", "0.5s", "1s"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [entry["gap"] for entry in found["gaps"]] == [15, 30]
+    assert main([*words, "--overlap", "0.9", "0.8"]) == 0
+    near, far = (entry["gap"] for entry in json.loads(capsys.readouterr().out)["gaps"])
+    assert 1 < near < far
+    for wrong, message in ((["--gaps", "1s", "30"], "seconds such as"), (["--overlap", "0.5", "0.9"], "largest first")):
+        assert main([*words, *wrong]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_keyframes_get_gaps_by_overlap_unless_they_are_given(capsys) -> None:
+    words = ["evaluate", "pose", str(bundled_sequence()), "--frontend", "orb", "--pairs", "2", "--workers", "1"]
+    assert main([*words, "--stride", "5"]) == 0  # 6 a second
+    shown = capsys.readouterr().out
+    assert re.search(r"overlaps 0.8 0.6 0.45 are \d+( \d+)* frames", shown)
+    assert main([*words, "--stride", "5", "--gaps", "3"]) == 0
+    assert "overlap" not in capsys.readouterr().out

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
 
-from improvo.errors import ConfigError
+from improvo.errors import ConfigError, MissingExtraError
 from improvo.frontend.classical import spread_over_image
 from improvo.frontend.registry import CLASSICAL, load_frontend
 from improvo.frontend.settings import NetworkOptions
@@ -89,3 +92,16 @@ def test_unknown_names_and_options_are_refused() -> None:
         load_frontend("shift")
     with pytest.raises(ConfigError, match="not a network"):
         load_frontend("orb", network=NetworkOptions(threshold=0.1))
+
+
+def test_surf_without_its_library_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mahotas", None)
+    monkeypatch.setattr("improvo.frontend.classical._opencv_surf", lambda threshold: None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'improvo\[surf\]'"):
+        load_frontend("surf")
+
+
+def test_akaze_without_opencv_contrib_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("improvo.frontend.classical._opencv", SimpleNamespace())
+    with pytest.raises(ConfigError, match="opencv-contrib-python"):
+        load_frontend("akaze")

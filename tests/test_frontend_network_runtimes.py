@@ -44,6 +44,73 @@ def test_openvino_agrees_with_torch(normalisation):
         np.testing.assert_allclose(ours, theirs, atol=TOLERANCE * np.abs(theirs).max())
 
 
+@pytest.mark.parametrize("normalisation", LAYOUTS)
+def test_onnx_runtime_agrees_with_openvino(normalisation):
+    pytest.importorskip("onnxruntime")
+    weights = random_weights(dataclasses.replace(TINY, normalisation=normalisation))
+    openvino, onnx = (NetworkFrontend(weights, NetworkSettings(runtime=name)) for name in ("openvino", "onnxruntime"))
+    assert onnx.runtime.name == "onnxruntime-float32"
+    images = np.stack([prepare(picture(seed=seed)) for seed in (0, 1)])[:, None]
+    for ours, theirs in zip(openvino.runtime(images), onnx.runtime(images), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=TOLERANCE * np.abs(theirs).max())
+
+
+def test_onnx_runtime_has_eight_bits_too():
+    pytest.importorskip("onnxruntime")
+    weights = random_weights(dataclasses.replace(TINY, encoder=(16,) * 8, head=32))
+    calibrated = calibrate(weights, [picture(seed=seed) for seed in range(5)])
+    image = prepare(picture(seed=7))[None, None]
+    onnx, openvino, exact = (
+        NetworkFrontend(calibrated, NetworkSettings(runtime=runtime, precision=precision)).runtime
+        for runtime, precision in (("onnxruntime", "auto"), ("openvino", "int8"), ("openvino", "float32"))
+    )
+    assert onnx.name == "onnxruntime-int8"
+    a, b, c = (runtime(image).descriptors[0].copy() for runtime in (onnx, openvino, exact))
+    assert not np.array_equal(a, c)
+    assert np.median(cosines(a, b)) > 0.999
+    assert np.median(cosines(a, c)) > 0.999
+
+
+def test_both_runtimes_measure_the_same_activation_ranges():
+    pytest.importorskip("onnxruntime")
+    from improvo.frontend import runtime_onnxruntime, runtime_openvino
+
+    weights, image = random_weights(), prepare(picture())[None, None]
+    ours, theirs = (each.activation_ranges(weights, image, 0.999) for each in (runtime_openvino, runtime_onnxruntime))
+    assert list(ours) == list(theirs)
+    np.testing.assert_allclose(list(ours.values()), list(theirs.values()), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("absent", "answer"), [("'openvino'", "onnxruntime-float32"), ("'openvino', 'onnxruntime'", "improvo[onnxruntime]")]
+)
+def test_without_openvino_onnx_runtime_takes_its_place(tmp_path, absent, answer):
+    pytest.importorskip("onnxruntime")
+    path = tmp_path / "tiny.safetensors"
+    weights = random_weights()
+    save_weights(path, weights.tensors, weights.card)
+    program = f"""
+import sys
+for name in ({absent},):
+    sys.modules[name] = None
+import numpy as np
+from improvo.errors import MissingExtraError
+from improvo.frontend.network import load_network_frontend
+try:
+    frontend = load_network_frontend({str(path)!r}, max_keypoints=7, border=2)
+    assert len(frontend(np.random.default_rng(0).random((40, 50)))) == 7
+    print(frontend.runtime.name)
+except MissingExtraError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
+    assert answer in done.stdout
+
+
+def cosines(a, b):
+    return (a * b).sum(-1) / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1)
+
+
 def test_the_unfolded_network_agrees_too():
     torch = pytest.importorskip("torch")
     from improvo.frontend.runtime_torch import load_network
@@ -208,3 +275,27 @@ def test_exported_onnx_finds_lit_pixels(tmp_path):
     image[0, 0, 36, 50] = 1  # in the border
     keypoints, valid = session.run(["keypoints", "valid"], {"image": image})
     assert sorted(map(tuple, keypoints[valid].tolist())) == [(13, 7), (41, 30)]
+
+
+@pytest.mark.skipif(not hasattr(cv2, "ALIKED"), reason="cv2.ALIKED came with OpenCV 5: pip install -U opencv-python")
+@pytest.mark.parametrize("size", [(101, 133), (64, 80)])
+def test_opencv_loads_the_exported_onnx_as_a_feature2d(tmp_path, size):
+    pytest.importorskip("onnx")
+    weights = random_weights()
+    save_weights(tmp_path / "tiny.safetensors", weights.tensors, weights.card)
+    target, options = str(tmp_path / "m.onnx"), ["--max-keypoints", "400", "--threshold", "0.01", "--layout", "opencv"]
+    assert main(["export", "onnx", str(tmp_path / "tiny.safetensors"), "-o", target, *options]) == 0
+    image = picture(*size)
+    parameters = cv2.ALIKED_Params()
+    parameters.inputSize = image.shape[::-1]
+    detector = cv2.ALIKED.create(target, parameters)
+    found, descriptors = detector.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), None)
+    expected = NetworkFrontend(weights, NetworkSettings(max_keypoints=400, corner_radius=0, threshold=0.01))(image)
+    assert 20 < len(expected) < 400
+    assert len(found) == len(expected)
+    places = np.array([keypoint.pt for keypoint in found])
+    theirs, ours = np.lexsort(np.round(places, 1).T), np.lexsort(np.round(expected.keypoints, 1).T)
+    np.testing.assert_allclose(places[theirs], expected.keypoints[ours], atol=1e-3)
+    np.testing.assert_allclose(descriptors[theirs], expected.descriptors[ours], atol=1e-4)
+    scores = np.array([keypoint.response for keypoint in found])
+    np.testing.assert_allclose(scores[theirs], expected.scores[ours], atol=1e-4)

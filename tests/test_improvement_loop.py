@@ -385,3 +385,55 @@ def test_a_folder_of_something_else_is_refused(walk: Path, tmp_path: Path) -> No
     (tmp_path / "mine.txt").write_text("keep me")
     with pytest.raises(OutputError, match="did not write"):
         run(tmp_path, [walk], FakeTraining())
+
+
+def test_a_growing_set_starts_from_the_last_weights_and_replays_what_it_had(
+    walk: Path, finished: tuple[Improvement, FakeTraining, list[str]], tmp_path: Path
+) -> None:
+    before = finished[0].weights.parent
+    hall = write_walk(tmp_path / "hall", frames=40, seed=1)
+    default = replace(SETTINGS, frontend=replace(SETTINGS.frontend, name="superpoint-small"))
+    training, lines = FakeTraining((0.02,)), list[str]()
+    progress = ImprovementProgress(lines.append)
+    recordings = [walk, hall]
+    result = run(tmp_path / "more", recordings, training, 1, settings=default, after=before, progress=progress)
+    (call,) = training.calls
+    start, kept = load_weights(call["start"]), load_weights(finished[0].weights)
+    assert all(np.array_equal(start.tensors[name], tensor) for name, tensor in kept.tensors.items())
+    new, replayed = call["seen"]
+    assert max(new) < 28
+    assert max(replayed) < 28  # what was held back of the first recording stays so
+    (store,) = call["labels"]
+    assert [labelled.name for labelled in read_labels(store)] == ["hall"]
+    name = f"{before.name}/room"
+    assert [validation.earlier for validation in result.validations] == [(name,)] * 2
+    assert {scores.recording for scores in result.validations[0].own} == {"hall"}
+    earlier = [scores for scores in result.validations[0].scores if scores.earlier]
+    assert [scores.pairs for scores in earlier] == [scores.pairs for scores in finished[0].validations[0].scores]
+    assert any(line.startswith("round 1: ") and f"; {name} " in line for line in lines)
+    for output, sequences, match in (
+        (tmp_path / "same", [walk], "add new ones"),
+        (before, [walk, hall], "cannot follow itself"),
+    ):
+        with pytest.raises(ImprovoError, match=match):
+            run(output, sequences, FakeTraining(), rounds=1, settings=default, after=before)
+    with pytest.raises(InputError, match="no finished folder"):
+        run(tmp_path / "other", [hall], FakeTraining(), settings=default, after=tmp_path)
+    assert not (tmp_path / "other").exists()
+    with pytest.raises(ConfigError, match="begun with"):
+        run(tmp_path / "more", [hall], FakeTraining(), rounds=1, settings=default)
+
+
+def test_what_makes_an_earlier_recording_worse_is_not_better() -> None:
+    settings = ValidationSettings()
+
+    def both(new: float, old: float) -> Validation:
+        one, other = validation([new] * 15), validation([old + 0.001 * row for row in range(15)])
+        return replace(one, scores=(*one.scores, replace(other.scores[0], recording="before/room", earlier=True)))
+
+    start = both(0.5, 0.6)
+    assert is_better(both(0.6, 0.6), start, settings)
+    assert is_better(both(0.6, 0.7), start, settings)
+    assert not is_better(both(0.6, 0.58), start, settings)
+    assert not is_better(both(0.5, 0.7), start, settings)
+    assert both(0.6, 0.2).mean("right_8px") == pytest.approx(0.6)

@@ -11,7 +11,7 @@ from simulated_features import CAMERA, error_percent, hand_motion, nothing_to_se
 
 from improvo.odometry import robust
 from improvo.odometry.initial_pair import InitFailure
-from improvo.odometry.settings import OdometrySettings
+from improvo.odometry.settings import BridgingSettings, OdometrySettings
 from improvo.odometry.states import TrackingState
 from improvo.odometry.trajectory_builder import FinalView
 from improvo.odometry.view import View
@@ -56,6 +56,8 @@ def contradicts_at(monkeypatch: pytest.MonkeyPatch, *frame_indices: int) -> None
     left = set(frame_indices)
 
     class Check:
+        ambiguous = False
+
         def __init__(self, *_: object) -> None:
             pass
 
@@ -90,7 +92,8 @@ def test_a_lost_camera_is_found_again_in_the_same_state() -> None:
 
 
 def test_too_many_lost_frames_end_the_segment_and_begin_the_next() -> None:
-    run = Run([*walk(50), *(nothing_to_see(i) for i in range(11)), *walk(110)[70:]])
+    settings = OdometrySettings(bridging=BridgingSettings(max_frames=0))  # it would find the place again
+    run = Run([*walk(50), *(nothing_to_see(i) for i in range(11)), *walk(110)[70:]], settings)
     assert run.states[60] is INITIALISING
     assert set(run.states[50:60]) == {LOST}
     assert run.odometry.segments[0].reason == "lost"

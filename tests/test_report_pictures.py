@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from improvo.cli.main import main
 from improvo.geometry.se3 import rigid, so3_exp
@@ -119,6 +120,12 @@ def test_sheet_files_and_video_have_the_frames_asked_for(finished_run: Path, tmp
     while video.read()[0]:
         read_back += 1
     assert read_back == 5
+    assert main([*show, "-o", str(tmp_path / "some.webm"), "--frames", "0,1,2", "--video-width", "160"]) == 0
+    assert cv2.VideoCapture(str(tmp_path / "some.webm")).get(cv2.CAP_PROP_FRAME_WIDTH) == 160
+    for name in ("some.webp", "some.gif"):
+        assert main([*show, "-o", str(tmp_path / name), "--frames", "0,1,2", "--video-width", "160"]) == 0
+        with Image.open(tmp_path / name) as moving:
+            assert (moving.n_frames, moving.size[0]) == (3, 160)
 
 
 def test_video_keeps_its_colours(tmp_path: Path) -> None:
@@ -150,6 +157,8 @@ def test_a_recording_that_moved_is_named_with_its_mend(
         (["map", "nowhere"], "no such folder"),
         (["labels", "RUN", "--frames", "3,99"], "there is no frame 99"),
         (["labels", "RUN", "--frames", "many"], "--frames many"),
+        (["labels", "RUN", "--each", "-o", "new.png"], "name a folder, or a video"),
+        (["labels", "RUN", "-o", "new.mp4", "--video-width", "3"], "at least 16 pixels"),
         (["map", "RUN", "-o", "no/such/place.png"], "no folder"),
         (["accuracy", "RUN"], "pose.json"),
         (["stability", "RUN"], "no stability head"),

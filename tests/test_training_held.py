@@ -22,6 +22,7 @@ from improvo.frontend.superpoint import SuperPoint  # noqa: E402
 from improvo.frontend.weights import DataSource, find_weights, load_weights  # noqa: E402
 from improvo.training.device_pairs import DevicePairs  # noqa: E402
 from improvo.training.held import HeldStage  # noqa: E402
+from improvo.training.held_settings import DevicePairSettings, HeldSettings  # noqa: E402
 from improvo.training.held_training import train_held  # noqa: E402
 from improvo.training.losses import held_loss, info_nce_loss  # noqa: E402
 from improvo.training.mixed_pairs import MixedPairs  # noqa: E402
@@ -31,13 +32,7 @@ from improvo.training.picture_store import DepthStore, PictureStore  # noqa: E40
 from improvo.training.pictures import Pictures, Source  # noqa: E402
 from improvo.training.posed import overlapping_pairs  # noqa: E402
 from improvo.training.random_views import random_views  # noqa: E402
-from improvo.training.settings import (  # noqa: E402
-    DevicePairSettings,
-    HeldSettings,
-    OptimiserSettings,
-    PhotometricSettings,
-    ViewSettings,
-)
+from improvo.training.settings import OptimiserSettings, PhotometricSettings, ViewSettings  # noqa: E402
 from improvo.training.stage import Stage  # noqa: E402
 from improvo.training.trainer import Trainer  # noqa: E402
 from improvo.training.views import inside, warp_image, warp_points  # noqa: E402
@@ -58,8 +53,8 @@ SMALL = HeldSettings(
 )  # fmt: skip
 
 
-def no_keypoints(views: Any) -> Any:
-    return torch.zeros(len(views), 65, views.shape[2] // 8, views.shape[3] // 8)
+def no_keypoints(views: Any, layers: int = 0) -> Any:
+    return torch.zeros(len(views), 65, views.shape[2] // 8, views.shape[3] // 8), views
 
 
 def photographs(count: int = 5, size: tuple[int, int] = (200, 150)) -> Source:
@@ -190,14 +185,34 @@ def test_pictures_and_frames_are_mixed_and_the_control_shows_one_frame_twice() -
 
 
 def test_points_are_taken_at_keypoints_of_the_detector() -> None:
-    def corner_of_each_cell(views: Any) -> Any:
-        logits = no_keypoints(views)
+    def corner_of_each_cell(views: Any, layers: int = 0) -> Any:
+        logits, stem = no_keypoints(views)
         logits[:, 3 * 8 + 5] = 9.0
-        return logits
+        return logits, stem
 
     batches = DevicePairs(Pictures((photographs(),)), [], SMALL, corner_of_each_cell, None, CPU)
     places = batches[0]["points_a"][:, :32] % 8
     assert torch.equal(places, torch.tensor([5.0, 3.0]).expand_as(places))
+
+
+def test_pairs_are_moved_to_where_the_pictures_agree() -> None:
+    room = posed_room()
+    poses = room.world_from_cam.copy()
+    poses[::2, 1, 3] += 0.03  # every other camera a little higher than it was
+    settings = replace(SMALL, pairs=replace(SMALL.pairs, posed_share=1.0, points=300))
+    off = []
+    for moved in (False, True):
+        chosen = replace(settings, pairs=replace(settings.pairs, aligned=moved))
+        batches = DevicePairs(Pictures(()), [replace(room, world_from_cam=poses)], chosen, no_keypoints, None, CPU)
+        batch = batches[0]
+        differences = []
+        for pair, valid in enumerate(batch["valid"]):
+            assert valid.float().mean() > 0.15
+            a = grey_at(batch["images"][pair, 0], batch["points_a"][pair][valid])
+            b = grey_at(batch["images"][4 + pair, 0], batch["points_b"][pair][valid])
+            differences.append(np.abs(a - b))
+        off.append(np.median(np.concatenate(differences)))
+    assert off[1] < 0.6 * off[0]
 
 
 def test_frames_that_share_nothing_make_no_pair() -> None:
@@ -334,8 +349,8 @@ class Tracks:
 def test_tracks_take_turns_with_dense_pairs_and_are_held_to_the_same_teachers() -> None:
     settings = replace(SMALL, stability_every=2)
 
-    def calm(views: Any) -> Any:
-        return torch.zeros(len(views), 2, 12, 16)
+    def calm(views: Any, layers: int = 0) -> Any:
+        return torch.zeros(len(views), 2, 12, 16), views
 
     dense = DevicePairs(Pictures(()), [posed_room()], settings, no_keypoints, calm, CPU)
     mixed = MixedPairs(dense, Tracks())  # type: ignore[arg-type]
@@ -349,3 +364,40 @@ def test_tracks_take_turns_with_dense_pairs_and_are_held_to_the_same_teachers() 
     network = HeldStage(SuperPoint(replace(ARCHITECTURES["superpoint-small"], stability=True)), settings)
     batch = {**odd, "images": odd["images"].float() / 255}
     assert torch.isfinite(network.losses(batch)["loss"])
+
+
+@pytest.mark.parametrize("frozen", [4, 8])
+def test_frozen_layers_and_what_reads_only_them_stay_to_the_bit(tmp_path: Path, frozen: int) -> None:
+    start = find_weights("superpoint-small")
+    settings = replace(SMALL, frozen_layers=frozen)
+    row = train_held(Pictures((photographs(),)), [posed_room()], settings, tmp_path / "out", start, progress=False)
+    assert np.isfinite(row["loss"])
+    before, after = load_weights(start).tensors, load_weights(tmp_path / "out" / "weights.safetensors").tensors
+    changed = {name for name, values in before.items() if not np.array_equal(values, after[name])}
+    kept = tuple(f"encoder.{layer}." for layer in range(frozen)) + (("detector.",) if frozen == 8 else ())
+    assert not [name for name in changed if name.startswith(kept)]
+    assert "descriptor.0.convolution.weight" in changed
+    assert any(name.startswith("encoder.") for name in changed) == (frozen < 8)
+    assert ("detector" in row) == (frozen < 8)
+
+
+def test_no_pair_of_any_kind_has_a_point_on_a_masked_pixel() -> None:
+    source, room = photographs(), posed_room()
+    left = np.ones((150, 200), np.bool_)
+    left[:, :90] = False
+    below = np.ones((120, 160), np.bool_)
+    below[70:] = False
+    painted = tuple(np.where(left, np.maximum(picture, 80), np.uint8(0)) for picture in source.pictures)
+    shown = tuple(np.where(below, np.maximum(picture, 80), np.uint8(0)) for picture in room.pictures)
+    masked = replace(source, pictures=painted, masks=(left,) * len(painted))
+    seen = replace(room, pictures=shown, masks=(below,) * len(shown))
+    for two_frames in (True, False):
+        settings = replace(SMALL, pairs=replace(SMALL.pairs, two_frames=two_frames))
+        batches = DevicePairs(Pictures((masked,)), [seen], settings, no_keypoints, None, CPU)
+        for step in range(3):
+            batch = batches[step]
+            for pair, valid in enumerate(batch["valid"]):
+                assert valid.any()
+                for name, image in (("points_a", pair), ("points_b", 4 + pair)):
+                    places = batch[name][pair][valid].round().long()
+                    assert (batch["images"][image, 0][places[:, 1], places[:, 0]] > 40).float().mean() > 0.98

@@ -309,8 +309,8 @@ def test_labels_without_enough_stable_points_are_one_line(
 def test_frames_that_are_useful_have_stable_points(store: Path) -> None:
     frames = frames_of(store, PAPER)
     assert len(frames) == FRAMES
-    assert len(frames.useful_frames(16)) == FRAMES
-    assert len(frames.useful_frames(100000)) == 0
+    assert len(frames.summary().useful_frames(16)) == FRAMES
+    assert len(frames.summary().useful_frames(100000)) == 0
 
 
 def test_the_stability_head_can_be_trained_alone(store: Path, tiny_weights: Path, tmp_path: Path) -> None:

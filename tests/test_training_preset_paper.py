@@ -23,6 +23,7 @@ from improvo.presets import preset  # noqa: E402
 from improvo.stability.rule import STABLE, UNSTABLE  # noqa: E402
 from improvo.training.labeled_frames import FramePoints, LabeledFrames  # noqa: E402
 from improvo.training.labels import DUSTBIN, IGNORED, PointLabels  # noqa: E402
+from improvo.training.landmarks import Summary  # noqa: E402
 from improvo.training.pairs import PairBatches  # noqa: E402
 from improvo.training.pictures import Pictures, Source  # noqa: E402
 from improvo.training.settings import (  # noqa: E402
@@ -64,16 +65,13 @@ class GreyFrames:
     def mask(self, frame: int) -> None:
         return None
 
-    def useful_frames(self, least: int) -> np.ndarray:
-        return np.arange(self.count) if least <= 20 else np.zeros(0, np.int64)
-
     def points(self, frame: int) -> FramePoints:
         places = np.random.default_rng(0).uniform(10, 60, (20, 2))
         landmark = np.arange(20) + (20 * frame if self.apart else 0)
         return FramePoints(places, landmark, np.full(20, STABLE, np.int8), np.ones(20, np.bool_))
 
-    def taught_stability(self) -> tuple[int, int]:
-        return 10, 1
+    def summary(self) -> Summary:
+        return Summary(np.full(self.count, 20, np.uint16), stable=10, unstable=1)
 
 
 def pairs_of(frames: Any, settings: OdometryTrainingSettings, batch_size: int = 50) -> TrackedPairs:

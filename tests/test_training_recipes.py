@@ -13,7 +13,8 @@ import yaml
 pytest.importorskip("torch", reason="training needs the extra `train`")
 
 from improvo import config
-from improvo.training.settings import HeldSettings, OdometryTrainingSettings
+from improvo.training.held_settings import HeldSettings
+from improvo.training.settings import OdometryTrainingSettings
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 

@@ -10,11 +10,10 @@ import pytest
 from improvo import config
 from improvo.errors import ConfigError
 from improvo.training import settings as training_settings
+from improvo.training.held_settings import DevicePairSettings, HeldSettings
 from improvo.training.settings import (
     AdaptationSettings,
     DetectorLossSettings,
-    DevicePairSettings,
-    HeldSettings,
     HomographiesSettings,
     LandmarkSettings,
     OdometryTrainingSettings,

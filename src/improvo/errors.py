@@ -1,4 +1,6 @@
-"""The exceptions of improvo: one base, caught once by the command line."""
+"""The exceptions of improvo: one base, caught once by the command line. And whether an optional package is there."""
+
+from importlib.util import find_spec
 
 
 class ImprovoError(Exception):
@@ -31,3 +33,11 @@ class MissingExtraError(ImprovoError):
 
     def __init__(self, feature: str, extra: str) -> None:
         super().__init__(f"{feature} needs an optional dependency: pip install 'improvo[{extra}]'")
+
+
+def installed(package: str) -> bool:
+    """Whether a package can be imported; nothing is loaded."""
+    try:
+        return find_spec(package) is not None
+    except ValueError:  # made unavailable by hand: None in sys.modules
+        return False

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
 import secrets
 import shutil
+import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from improvo import locations
 from improvo.errors import InputError, OutputError
+from improvo.formats import FORMAT, FORMAT_KEY, check_format
 from improvo.untrusted.paths import check_path
 from improvo.untrusted.text import load_json
 
@@ -22,7 +27,9 @@ if TYPE_CHECKING:
 
 MARKER = ".improvo.json"
 FORMER_NAME = "sivo"  # of this package; folders and weights written under it stay readable
-_TEMPORARY = re.compile(r"\..+\.(\d+)(?:-\w+)?\.partial(?:\..*)?", re.DOTALL)  # .NAME.PROCESS-CHANCE.partial.SUFFIX
+_TEMPORARY = re.compile(r"\..+\.(\d+)(?:-(\w+))?\.partial(?:\..*)?", re.DOTALL)  # see `temporary_name`
+_HOST = hashlib.sha256(socket.gethostname().encode()).hexdigest()[:6]
+_FOREIGN_SECONDS = 86400.0  # after which a temporary file of another machine is of a process that ended
 _LONGEST_NAME = 100  # characters of a name that go into that of its temporary file
 _open_here: set[str] = set()  # names of temporary files and folders that this process is writing
 
@@ -43,6 +50,8 @@ def written_atomically(path: Path) -> Iterator[Path]:
         _open_here.add(temporary.name)
         yield temporary
         os.replace(temporary, path)
+        made = False
+        locations.written(path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error}); choose another folder") from None
     finally:
@@ -53,8 +62,11 @@ def written_atomically(path: Path) -> Iterator[Path]:
 
 
 def temporary_name(name: str, suffix: str = "") -> str:
-    """A hidden name for what is not complete; nobody can guess it, and `clear_leftovers` knows whose it was."""
-    return f".{name[:_LONGEST_NAME]}.{os.getpid()}-{secrets.token_hex(4)}.partial{suffix[:20]}"
+    """A hidden name for what is not complete; nobody can guess it, and `clear_leftovers` knows whose it was.
+
+    .NAME.PROCESS-MACHINE+CHANCE.partial.SUFFIX
+    """
+    return f".{name[:_LONGEST_NAME]}.{os.getpid()}-{_HOST}{secrets.token_hex(4)}.partial{suffix[:20]}"
 
 
 def clear_leftovers(folder: Path) -> None:
@@ -62,14 +74,28 @@ def clear_leftovers(folder: Path) -> None:
     for place, folders, names in os.walk(folder):
         for name in [*names, *folders]:
             match = _TEMPORARY.fullmatch(name)
-            if match is None or name in _open_here or _is_running(int(match.group(1)[:9])):
-                continue
             leftover = Path(place) / name
+            if match is None or is_being_written(leftover):
+                continue
             if leftover.is_dir() and not leftover.is_symlink():
                 shutil.rmtree(leftover, ignore_errors=True)
             else:
                 with suppress(OSError):
                     leftover.unlink(missing_ok=True)
+
+
+def is_being_written(path: Path) -> bool:
+    """Whether this is a temporary file or folder, and the process that made it may still write it."""
+    match = _TEMPORARY.fullmatch(path.name)
+    if match is None:
+        return False
+    process, token = int(match.group(1)[:9]), match.group(2) or ""
+    if len(token) == len(_HOST) + 8 and not token.startswith(_HOST):  # of another machine, on a shared file system
+        try:
+            return time.time() - path.lstat().st_mtime < _FOREIGN_SECONDS
+        except OSError:
+            return True
+    return path.name in _open_here or _is_running(process)
 
 
 def _is_running(process: int) -> bool:
@@ -122,7 +148,7 @@ def check_output_folder(path: Path, command: str) -> None:
     """Refuse a folder that `command` did not make, before any work is done.
 
     Raises:
-        OutputError: the path is a file, a folder with other content, or cannot be written.
+        OutputError: the path is a file, a folder with other content or of a later improvo, or cannot be written.
     """
     try:
         check_path(path)
@@ -130,6 +156,10 @@ def check_output_folder(path: Path, command: str) -> None:
         raise OutputError(str(error)) from None
     if path.exists() and not path.is_dir():
         raise OutputError(f"{path}: is a file, not a folder; choose another output folder")
+    try:
+        check_folder_format(path)
+    except InputError as error:
+        raise OutputError(str(error)) from None
     if path.is_dir() and any(not _is_temporary(entry) for entry in path.iterdir()):
         owner = _owner(path)
         if owner != command:
@@ -147,7 +177,7 @@ def make_output_folder(path: Path, command: str) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{path}: cannot be created ({error.strerror}); choose another output folder") from None
-    write_json(path / MARKER, {"made_by": command})
+    write_json(path / MARKER, {"made_by": command, FORMAT_KEY: FORMAT})
     clear_leftovers(path)
 
 
@@ -156,13 +186,28 @@ def _is_temporary(path: Path) -> bool:
     return path.name.startswith(".") and ".partial" in path.suffixes
 
 
+def check_folder_format(path: Path) -> None:
+    """Refuse a folder that a later improvo made.
+
+    Raises:
+        InputError: see `formats.check_format`.
+    """
+    check_format(_marker(path).get(FORMAT_KEY), path)
+
+
 def _owner(path: Path) -> str | None:
     """The command that made a folder; None where no marker says so."""
+    owner = _marker(path).get("made_by")
+    return owner if isinstance(owner, str) else None
+
+
+def _marker(path: Path) -> dict[str, Any]:
+    """What the marker of a folder says; empty where there is none."""
     for name in (MARKER, f".{FORMER_NAME}.json"):
         try:
             marker = load_json((path / name).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             continue
-        if isinstance(marker, dict) and isinstance(marker.get("made_by"), str):
-            return str(marker["made_by"])
-    return None
+        if isinstance(marker, dict):
+            return marker
+    return {}

@@ -1,38 +1,102 @@
-"""One process at a time works in an output folder: two would append to the same files.
+"""One process at a time works in an output folder, or on a part of it: two would write the same files.
 
-The lock belongs to a process, not to the file. However a process ends, it no longer holds the lock.
+The lock belongs to a process, not to the file. However a process ends, it no longer holds the lock. The system's own
+file locks say so at once. Where they do not reach (some shared file systems, between machines), a holder renews the
+time of its lock file, and one whose file does not change any more is dead.
 """
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import socket
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import Any
 
-from improvo.errors import OutputError
+from improvo.errors import ImprovoError, OutputError
+from improvo.files import MARKER, make_output_folder
 
 LOCK = ".improvo.lock"
-_held: dict[Path, int] = {}  # locked folder -> the thread of this process that holds it
+_BEAT_SECONDS = 5.0
+_PATIENCE_SECONDS = 75.0  # without a beat, after which a holder elsewhere is dead; NFS shows old times for a minute
+_LONGEST = 1000  # bytes of a lock file
+_SOMEBODY = "another process"
+_held: dict[Path, int] = {}  # lock file -> the thread of this process that holds it
 _guard = threading.Lock()
+
+
+class BusyError(OutputError):
+    """Somebody else is at work there.
+
+    Args:
+        path: that is held.
+        holder: who it is, in words.
+    """
+
+    def __init__(self, path: Path, holder: str) -> None:
+        super().__init__(f"{path}: {holder} is at work there; wait until it ends, or choose another output folder")
+        self.holder = holder
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _busy_again, (str(self), self.holder)
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Nobody else works in the folder within the block. A block within a block of the same folder is allowed.
 
-    Where the system or the file system knows no locks, the block runs without one.
-
     Args:
         folder: exists already.
 
     Raises:
-        OutputError: another process or thread is at work there; the message says which.
+        BusyError: another process or thread is at work there; the message says which, and since when.
     """
-    place, thread = folder.resolve(), threading.get_ident()
+    with claimed(folder / LOCK, folder):
+        yield
+
+
+@contextmanager
+def working_in(folder: Path, command: str) -> Iterator[None]:
+    """Make an output folder, and be the only one to work there within the block.
+
+    A folder that was not there before and in which nothing was written is removed where the block fails.
+
+    Args:
+        folder, command: see `make_output_folder`.
+
+    Raises:
+        OutputError: the folder cannot be used; a `BusyError` if another process is at work there.
+    """
+    new = not folder.exists()
+    make_output_folder(folder, command)
+    try:
+        with locked(folder):
+            yield
+    except ImprovoError:
+        if new and [path.name for path in folder.iterdir()] == [MARKER]:
+            shutil.rmtree(folder)
+        raise
+
+
+@contextmanager
+def claimed(file: Path, what: Path | None = None) -> Iterator[None]:
+    """As `locked`, for anything that a lock file stands for.
+
+    Args:
+        file: of the lock; its folder exists already. It is there only while the lock is held.
+        what: named in the message; the file if None.
+
+    Raises:
+        BusyError: another process or thread holds it.
+        OutputError: the file cannot be written.
+    """
+    what = what or file
+    place, thread = file.resolve(), threading.get_ident()
     with _guard:
         holder = _held.get(place)
         if holder is None:
@@ -41,33 +105,181 @@ def locked(folder: Path) -> Iterator[None]:
         yield
         return
     if holder is not None:
-        raise _busy(folder, f"another thread of process {os.getpid()}")
+        raise BusyError(what, f"another thread of process {os.getpid()}")
     try:
-        with (folder / LOCK).open("a+") as stream:
-            _lock(stream, folder)
+        lock = _LockFile(file, what)
+        try:
             yield
-            stream.truncate(0)
+        finally:
+            lock.release()
     finally:
         with _guard:
             del _held[place]
 
 
-def _lock(stream: IO[str], folder: Path) -> None:
+class _LockFile:
+    """A lock that this process holds, from its making to `release`."""
+
+    def __init__(self, file: Path, what: Path) -> None:
+        self._file, self._what = file, what
+        self._released = threading.Event()
+        try:
+            self._descriptor = self._opened()
+        except BlockingIOError:
+            raise BusyError(what, holder_of(file) or _SOMEBODY) from None
+        except OSError as error:
+            raise OutputError(f"{file}: cannot be written ({error.strerror}); choose another folder") from None
+        try:
+            self._take()
+        except BaseException:
+            os.close(self._descriptor)
+            raise
+        threading.Thread(target=self._beat, daemon=True, name="lock").start()
+
+    def release(self) -> None:
+        """Let go; the file vanishes before somebody else can have it."""
+        self._released.set()
+        with suppress(OSError):
+            os.unlink(self._file)
+        with suppress(OSError):
+            os.close(self._descriptor)
+
+    def _opened(self) -> int:
+        """The file, locked by the system where it can; never one that its holder has removed meanwhile."""
+        while True:
+            descriptor = os.open(self._file, os.O_RDWR | os.O_CREAT, 0o666)
+            try:
+                self._by_system = _lock(descriptor)
+                with suppress(FileNotFoundError):
+                    if os.path.samestat(os.fstat(descriptor), os.stat(self._file)):
+                        return descriptor
+            except BaseException:
+                os.close(descriptor)
+                raise
+            os.close(descriptor)
+
+    def _take(self) -> None:
+        """Write who holds it, once whoever stands there is known to be gone."""
+        before = self._content()
+        if before and not self._is_gone(before):
+            raise BusyError(self._what, _words(before))
+        mine = json.dumps({
+            "process": os.getpid(), "host": socket.gethostname(), "since": time.strftime("%Y-%m-%d %H:%M:%S"),
+            "token": os.urandom(8).hex(),
+        })  # fmt: skip
+        os.ftruncate(self._descriptor, 0)
+        os.pwrite(self._descriptor, mine.encode(), 0)
+        if not self._by_system:  # two that begin at once both come here; the last one to write has it
+            time.sleep(1.0)
+            if (now := self._content()) != json.loads(mine):
+                raise BusyError(self._what, _words(now))
+
+    def _content(self) -> dict[str, Any]:
+        """What stands in the file. To open and close it once more would give the system's lock away."""
+        return _parsed(os.pread(self._descriptor, _LONGEST, 0))
+
+    def _is_gone(self, holder: dict[str, Any]) -> bool:
+        """Whether the process that the file names is dead, or somewhere else without a beat."""
+        if holder.get("host") == socket.gethostname():
+            return self._by_system or not _is_running(holder.get("process"))
+        ends = time.monotonic() + _PATIENCE_SECONDS
+        beat = os.stat(self._file).st_mtime_ns
+        while time.monotonic() < ends:
+            time.sleep(_BEAT_SECONDS / 5)
+            try:
+                if os.stat(self._file).st_mtime_ns != beat:
+                    return False
+            except FileNotFoundError:  # it has let go just now; the next try will succeed
+                return False
+        return True
+
+    def _beat(self) -> None:
+        while not self._released.wait(_BEAT_SECONDS):
+            with suppress(OSError):
+                os.utime(self._file)
+
+
+def seems_held(file: Path) -> bool:
+    """Whether somebody holds a lock, said at once; a holder on another machine may have died since."""
+    if file.resolve() in _held:
+        return True
+    try:
+        descriptor = os.open(file, os.O_RDWR)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    try:
+        by_system = _lock(descriptor)
+        holder = _parsed(os.pread(descriptor, _LONGEST, 0))
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    if not holder:
+        return False
+    if holder.get("host") == socket.gethostname():
+        return not by_system and _is_running(holder.get("process"))
+    return True
+
+
+def holder_of(file: Path) -> str:
+    """Who a lock file of another process says holds it, in words; empty where it does not say."""
+    try:
+        with file.open("rb") as stream:
+            found = _parsed(stream.read(_LONGEST))
+    except OSError:
+        return ""
+    return _words(found) if found else ""
+
+
+def _lock(descriptor: int) -> bool:
+    """Whether the system knows locks, and this process has it now.
+
+    Raises:
+        BlockingIOError: another process has it.
+    """
     try:
         import fcntl
     except ImportError:  # not on Windows
-        return
+        return False
     try:
-        fcntl.lockf(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except (BlockingIOError, PermissionError):
-        stream.seek(0)
-        raise _busy(folder, stream.read().strip() or "another process") from None
+        raise BlockingIOError from None
     except OSError:  # a file system without locks
-        return
-    stream.truncate(0)
-    stream.write(f"process {os.getpid()} on {socket.gethostname()}")
-    stream.flush()
+        return False
+    return True
 
 
-def _busy(folder: Path, who: str) -> OutputError:
-    return OutputError(f"{folder}: {who} is at work there; wait until it ends, or choose another output folder")
+def _parsed(content: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(content)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _words(holder: dict[str, Any]) -> str:
+    if not holder:
+        return _SOMEBODY
+    who = f"process {holder.get('process')} on {holder.get('host')}"
+    return f"{who} (since {holder['since']})" if holder.get("since") else who
+
+
+def _is_running(process: object) -> bool:
+    if os.name != "posix" or not isinstance(process, int):
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def _busy_again(message: str, holder: str) -> BusyError:
+    error = BusyError.__new__(BusyError)
+    error.args, error.holder = (message,), holder
+    return error

@@ -14,6 +14,11 @@ INTERVAL = 20.0  # seconds between two lines, where there is no terminal
 _quiet = False
 
 
+def counted(count: int, unit: str) -> str:
+    """`1 frame`, `2 frames`."""
+    return f"{count} {unit}" if count == 1 else f"{count} {unit}s"
+
+
 @contextmanager
 def quiet(quiet: bool = True) -> Iterator[None]:
     """Show no progress within; `quiet` False shows it."""
@@ -91,11 +96,22 @@ def stages(unit: str) -> Iterator[Callable[[str, int, int], None]]:
 
 
 class _Bar(Progress):
+    """The clock starts with the first unit: what comes before it, such as loading, would spoil the first estimates."""
+
     def __init__(self, bar: Any) -> None:
         self._bar = bar
+        self._began = False
 
     def advance(self, count: int = 1) -> None:
-        self._bar.update(count)
+        if self._began:
+            self._bar.update(count)
+            return
+        self._began = True
+        bar = self._bar
+        bar.n += count
+        bar.initial = bar.last_print_n = bar.n
+        bar.start_t = bar.last_print_t = time.time()
+        bar.refresh()
 
     def describe(self, words: str) -> None:
         self._bar.set_description(words)
@@ -109,11 +125,14 @@ class _Lines(Progress):
         self._words, self._unit, self._total, self._stream = words, unit, total, stream
         self._first = self._done = done
         self._note = ""
-        self._began = self._said = time.monotonic()
+        self._said = time.monotonic()
+        self._began: float | None = None  # when the first unit was done: the rate is that of the others
 
     def advance(self, count: int = 1) -> None:
         self._done += count
         now = time.monotonic()
+        if self._began is None:
+            self._began, self._first = now, self._done
         if now - self._said >= INTERVAL:
             self._said = now
             print(self._text(now - self._began), file=self._stream, flush=True)
@@ -126,13 +145,14 @@ class _Lines(Progress):
 
     def _text(self, seconds: float) -> str:
         rate = (self._done - self._first) / max(seconds, 1e-9)
-        text = f"{self._words}: {self._done}"
+        speed = f", {rate:.3g} a second" if rate > 0 else ""
         if self._total:
-            text += f" of {self._total} {self._unit}s ({100 * self._done // self._total} %), {rate:.3g} a second"
+            share = 100 * self._done // self._total
+            text = f"{self._words}: {self._done} of {counted(self._total, self._unit)} ({share} %){speed}"
             if rate > 0:
                 text += f", {_duration((self._total - self._done) / rate)} left"
         else:
-            text += f" {self._unit}s, {rate:.3g} a second"
+            text = f"{self._words}: {counted(self._done, self._unit)}{speed}"
         return f"{text}; {self._note}" if self._note else text
 
 

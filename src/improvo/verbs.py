@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from improvo.locations import local_folder, publish
+
 if TYPE_CHECKING:
     from improvo.evaluation.settings import PoseSettings, TrajectorySettings
     from improvo.evaluation.trajectory.protocol import TrajectoryErrors
@@ -51,6 +53,7 @@ def run(
     """
     from improvo.depth.dense import refuse_live, write_dense
     from improvo.depth.run_settings import DenseRunSettings
+    from improvo.folder_lock import working_in
     from improvo.labeling.labeler import run_and_label
     from improvo.odometry.run_settings import RunSettings
     from improvo.odometry.scale.apply import apply_scale
@@ -61,21 +64,24 @@ def run(
     from improvo.sequences.rates import AUTO
 
     settings = settings or RunSettings()
+    folder = local_folder(output)
     if isinstance(sequence, str | Path):
         if settings.sequence.camera == AUTO:
-            settings = replace(settings, sequence=_found([sequence], settings.sequence, Path(output), "run"))
+            settings = replace(settings, sequence=_found([sequence], settings.sequence, folder, "run"))
         sequence = open_sequence(sequence, settings.sequence)
     depth = settings.depth if isinstance(settings, DenseRunSettings) and settings.dense else None
     if depth is not None:
         refuse_live(sequence)
     scale = settings.scale if isinstance(settings, DenseRunSettings) else ScaleSettings()
     ask = scale_source(sequence, scale)  # before any work
-    result = run_and_label(sequence, Path(output), settings, frontend=frontend)
-    result = with_camera_note(result, settings.sequence.camera)
-    if ask is not None:
-        result = apply_scale(sequence, result, ask, scale)
-    if depth is not None:
-        write_dense(sequence, result, depth)
+    with working_in(folder, "run"):
+        result = run_and_label(sequence, folder, settings, frontend=frontend)
+        result = with_camera_note(result, settings.sequence.camera)
+        if ask is not None:
+            result = apply_scale(sequence, result, ask, scale)
+        if depth is not None:
+            write_dense(sequence, result, depth)
+    publish(folder)
     return result
 
 
@@ -106,8 +112,11 @@ def label(
     from improvo.odometry.run_settings import LabelRunSettings
 
     chosen = settings or LabelRunSettings()
-    chosen = replace(chosen, sequence=_found(sequences, chosen.sequence, Path(output), "label"))
-    return label_sequences([Path(path) for path in sequences], Path(output), chosen, workers, ray=ray)
+    folder = local_folder(output)
+    chosen = replace(chosen, sequence=_found(sequences, chosen.sequence, folder, "label"))
+    records = label_sequences([Path(path) for path in sequences], folder, chosen, workers, ray=ray)
+    publish(folder)
+    return records
 
 
 def find_camera(sequence: PathLike, settings: SelfCalibrationSettings | None = None) -> CameraFromMotion:
@@ -176,10 +185,17 @@ def train_odometry(
     need_torch()
     from improvo.training import stages
 
-    settings, folder = settings or OdometryTrainingSettings(), Path(output)
+    settings, folder = settings or OdometryTrainingSettings(), local_folder(output)
     metrics = stages.train_odometry(
-        [Path(path) for path in labels], settings, folder, find_weights(start), tuple(data), False, list(pictures)
+        [local_folder(path, writing=False) for path in labels],
+        settings,
+        folder,
+        find_weights(start),
+        tuple(data),
+        False,
+        list(pictures),
     )
+    publish(folder)
     return Trained(folder / "weights.safetensors", metrics)
 
 
@@ -204,6 +220,7 @@ def improve(
     rounds: int = 1,
     evaluate: Sequence[PathLike] = (),
     workers: int = 1,
+    after: PathLike | None = None,
 ) -> Improvement:
     """The loop: label, train, validate, and keep the better weights, as `improvo improve` does it.
 
@@ -214,6 +231,7 @@ def improve(
         rounds: of labelling, training and validation.
         evaluate: recordings to hold out; without any, some of `sequences`, or the last part of a single one.
         workers: sequences labelled at a time.
+        after: finished folder of an earlier call, whose recordings are replayed and must not get worse.
 
     Raises:
         MissingExtraError: torch is not installed.
@@ -225,9 +243,13 @@ def improve(
     from improvo.improvement.settings import ImproveSettings
 
     recordings, held_out = [Path(path) for path in sequences], [Path(path) for path in evaluate]
+    folder = local_folder(output)
     settings = settings or ImproveSettings()
-    settings = replace(settings, sequence=_found([*recordings, *held_out], settings.sequence, Path(output), "improve"))
-    return run_rounds(recordings, Path(output), settings, rounds, held_out, workers)
+    settings = replace(settings, sequence=_found([*recordings, *held_out], settings.sequence, folder, "improve"))
+    before = local_folder(after) if after is not None else None
+    result = run_rounds(recordings, folder, settings, rounds, held_out, workers, after=before)
+    publish(folder)
+    return result
 
 
 @dataclass(frozen=True)

@@ -158,22 +158,28 @@ COMMANDS: dict[str, Command] = {
     ),
     "report": Command("one HTML page about a run, labels or an evaluation", "report"),
     "export": Command(
-        "what other tools read: COLMAP, Nerfstudio, trajectories, ONNX",
+        "what other tools read: COLMAP, Nerfstudio, trajectories, features, ONNX",
         part_name="TARGET",
         parts={
             "colmap": Command("a finished run as COLMAP's sparse model, with images", "export:colmap"),
             "nerfstudio": Command("a finished run as Nerfstudio's transforms.json, with images", "export:nerfstudio"),
             "trajectory": Command("the poses of a finished run as TUM, KITTI or EuRoC file", "export:trajectory"),
+            "features": Command(
+                "features and matches of a recording, for hloc or COLMAP",
+                "export_features",
+                "improvo.export.settings:FeatureExportSettings",
+            ),
             "onnx": Command("a network with its decoding, for ONNX Runtime", "export:onnx"),
         },
     ),
     "weights": Command(
-        "import public weights, prepare weights for int8, print a model card",
+        "import public weights, export ours for other programs, prepare for int8, print a model card",
         part_name="ACTION",
         parts={
             "import": Command(
                 "convert a public SuperPoint weights file (three layouts, .pth or .safetensors)", "weights:import"
             ),
+            "export": Command("write weights in the layout of another SuperPoint implementation", "weights:export"),
             "calibrate": Command(
                 "measure activation ranges on pictures, so that weights can run in int8", "weights:calibrate"
             ),
@@ -199,4 +205,5 @@ COMMANDS: dict[str, Command] = {
     ),
     "demo": Command("the main job on a small bundled recording, in minutes", "demo"),
     "config": Command("print all settings of a command as YAML", "config"),
+    "completion": Command("a completion script for bash, zsh or fish", "completion"),
 }

@@ -10,15 +10,16 @@ import argparse
 import json
 import tempfile
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments, add_truth_argument
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import figures, next_step, say
-from improvo.errors import ImprovoError, InputError
-from improvo.evaluation.settings import ESTIMATORS, PoseCommandSettings, PoseSettings
+from improvo.errors import ConfigError, ImprovoError, InputError
+from improvo.evaluation.settings import ESTIMATORS, USUAL_OVERLAPS, PoseCommandSettings, PoseSettings
 from improvo.geometry.depth_sampling import SAMPLINGS
 from improvo.untrusted.text import read_json_file
 
@@ -29,7 +30,6 @@ COMMAND = "evaluate pose"
 
 
 _FLAGS = {
-    "gaps": "pose.gaps",
     "pairs": "pose.pairs",
     "estimator": "pose.estimators",
     "depth_sampling": "pose.depth_sampling",
@@ -42,7 +42,9 @@ _FLAGS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `improvo evaluate pose`."""
     defaults, absent = PoseSettings(), argparse.SUPPRESS
-    parser.add_argument("sequences", nargs="*", type=Path, metavar="SEQUENCE", help="with depth and true poses")
+    parser.add_argument(
+        "sequences", nargs="*", type=recording_path, metavar="SEQUENCE", help="with depth and true poses"
+    )
     add_truth_argument(parser)
     add_frontend_arguments(parser, defaults.max_keypoints)
     parser.add_argument(
@@ -53,8 +55,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="features exported by another program: a folder of NPZ files, or an HDF5 file of hloc; repeatable",
     )
     gaps = " ".join(map(str, defaults.gaps))
-    parser.add_argument(
-        "--gaps", nargs="+", type=int, default=absent, help=f"frames between the two images (default: {gaps})"
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument(
+        "--gaps",
+        nargs="+",
+        metavar="N",
+        help=f"frames between the two images, or seconds such as 1s 2s 3s (default: {gaps} frames; by --overlap where "
+        "the recording has fewer than 10 frames a second)",
+    )
+    group.add_argument(
+        "--overlap",
+        nargs="+",
+        type=float,
+        metavar="SHARE",
+        help=f"gaps at which the second image still shows so much of the first "
+        f"(default: {' '.join(f'{share:g}' for share in USUAL_OVERLAPS)}, those of 30, 60 and 90 frames of a handheld "
+        "30 Hz recording)",
     )
     parser.add_argument(
         "--pairs", type=int, default=absent, metavar="N", help=f"per sequence and gap (default: {defaults.pairs})"
@@ -64,7 +80,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         choices=ESTIMATORS,
         default=absent,
-        help="opencv: default solvePnPRansac, the paper's; poselib: a robust one (default: both)",
+        help="opencv: default solvePnPRansac, the paper's; poselib: a robust one; usac: "
+        f"OpenCV's robust one (default: {' '.join(defaults.estimators)})",
     )
     parser.add_argument(
         "--depth-sampling", choices=SAMPLINGS, default=absent, help=f"(default: {defaults.depth_sampling})"
@@ -164,12 +181,46 @@ def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _settings(arguments: argparse.Namespace) -> tuple[PoseSettings, list[Recorded]]:
+    """The settings, with gaps in frames, and the sequences."""
     from improvo.cli.evaluate_options import recorded_sequences
+    from improvo.evaluation.pose.gaps import is_slow, with_gaps_in_frames
 
-    settings = settings_from(PoseCommandSettings, arguments, _FLAGS)
+    settings = settings_from(PoseCommandSettings, arguments, _FLAGS, _gap_settings(arguments))
     output = arguments.output if arguments.export_images is None else None
     settings = with_found_camera(settings, arguments.sequences, output, COMMAND)
-    return settings.pose, recorded_sequences(arguments, settings.sequence)
+    sources = recorded_sequences(arguments, settings.sequence)
+    chosen = settings.pose
+    sequences = [source.open() for source in sources]
+    flags = arguments.gaps or arguments.overlap or getattr(arguments, "preset", None)
+    fixed = flags or chosen.gap_seconds or chosen.overlaps
+    if not fixed and chosen.gaps == PoseSettings().gaps and all(is_slow(sequence) for sequence in sequences):
+        chosen = replace(chosen, overlaps=USUAL_OVERLAPS)
+    in_frames = with_gaps_in_frames(chosen, sequences, fewer=not fixed)
+    if in_frames != chosen:
+        asked = " ".join([f"{each:g}s" for each in chosen.gap_seconds] or [f"{each:g}" for each in chosen.overlaps])
+        what = "overlaps" if chosen.overlaps else "gaps"
+        say(f"{what} {asked} are {' '.join(map(str, in_frames.gaps))} frames")
+    return in_frames, sources
+
+
+def _gap_settings(arguments: argparse.Namespace) -> list[str]:
+    """The settings that `--gaps` and `--overlap` stand for.
+
+    Raises:
+        ConfigError: neither frames nor seconds, or a mixture.
+    """
+    if arguments.overlap:
+        return [f"pose.overlaps={arguments.overlap}"]
+    if not arguments.gaps:
+        return []
+    in_seconds = [word.endswith("s") for word in arguments.gaps]
+    try:
+        if all(in_seconds):
+            return [f"pose.gap_seconds={[float(word[:-1]) for word in arguments.gaps]}"]
+        return [f"pose.gaps={[int(word) for word in arguments.gaps]}"]
+    except ValueError:
+        words = " ".join(arguments.gaps)
+        raise ConfigError(f"--gaps {words}: give frames such as 30 60 90, or seconds such as 1s 2s 3s") from None
 
 
 def _request(settings: PoseSettings, sources: list[Recorded], frontends: list[FeatureSource]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from improvo.cli.evaluate_options import (
     add_truth_argument,
 )
 from improvo.cli.evaluate_trajectory import TRAJECTORY_FLAGS, add_trajectory_arguments
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import figures, next_step
 from improvo.evaluation.settings import VoCommandSettings
 
@@ -31,7 +31,7 @@ _FLAGS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `improvo evaluate vo`; `--stride` is 10 unless given."""
     defaults = VoCommandSettings()
-    parser.add_argument("sequences", nargs="+", type=Path, metavar="SEQUENCE", help="with true poses")
+    parser.add_argument("sequences", nargs="+", type=recording_path, metavar="SEQUENCE", help="with true poses")
     add_truth_argument(parser)
     add_frontend_arguments(parser, defaults.max_keypoints)
     parser.add_argument(

@@ -99,6 +99,9 @@ def add_onnx_arguments(parser: argparse.ArgumentParser) -> None:
     defaults = NetworkSettings()
     parser.add_argument("weights", metavar="WEIGHTS", help="a bundled name or a weights file")
     parser.add_argument("-o", "--output", type=Path, required=True, help="ONNX file to write")
+    parser.add_argument(
+        "--layout", choices=("improvo", "opencv"), default="improvo", help="opencv: a file that `cv2.ALIKED` loads"
+    )
     for name in _ONNX_SETTINGS:
         add_setting(parser, defaults, f"--{name.replace('_', '-')}", name)
 
@@ -114,10 +117,13 @@ def run_onnx(arguments: argparse.Namespace) -> None:
     settings = NetworkSettings(**given, corner_radius=0)
     if not arguments.output.parent.is_dir():
         raise OutputError(f"{arguments.output}: no folder {arguments.output.parent}; make it first")
-    export_onnx(load_weights(find_weights(arguments.weights)), arguments.output, settings)
-    say(f"{arguments.output}: image (batch, 1, height, width) in [0, 1] -> {settings.max_keypoints} keypoints")
+    export_onnx(load_weights(find_weights(arguments.weights)), arguments.output, settings, arguments.layout)
+    for_opencv = arguments.layout == "opencv"
+    image = "(1, 3, height, width) RGB" if for_opencv else "(batch, 1, height, width)"
+    say(f"{arguments.output}: image {image} in [0, 1] -> {settings.max_keypoints} keypoints")
     say("without the move to the image's corners (`improvo.frontend.corners`), which `improvo run` makes afterwards")
-    next_step("load it with ONNX Runtime or any other runtime")
+    reader = f"cv2.ALIKED.create('{arguments.output}', parameters)" if for_opencv else ""
+    next_step(f"`{reader}` in OpenCV 5" if reader else "load it with ONNX Runtime or any other runtime")
 
 
 def _add_model_arguments(parser: argparse.ArgumentParser, contents: str) -> None:

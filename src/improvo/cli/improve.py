@@ -13,11 +13,20 @@ from improvo.cli import output
 from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.flags import add_setting
 from improvo.cli.label import add_job_arguments
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, check_recordings, settings_from
+from improvo.cli.options import (
+    add_config_arguments,
+    add_sequence_arguments,
+    check_recordings,
+    folder_path,
+    recording_path,
+    settings_from,
+)
 from improvo.cli.output import figures, next_step, notice, say
+from improvo.cli.plan import say_improve_plan
 from improvo.cli.train_options import add_data_card, read_data_card
 from improvo.errors import ConfigError
 from improvo.files import check_output_folder
+from improvo.frontend.registry import check_frontend
 from improvo.improvement.settings import RECIPES, ImproveSettings
 from improvo.verbs import need_torch
 
@@ -26,10 +35,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `improvo improve`."""
     defaults = ImproveSettings()
     parser.add_argument(
-        "sequences", type=Path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
+        "sequences", type=recording_path, nargs="+", metavar="SEQUENCE", help="videos, image folders or data sets"
     )
     parser.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="OUT", help="folder; an unfinished one is continued"
+        "-o", "--output", type=folder_path, metavar="OUT", help="folder; an unfinished one is continued"
+    )
+    parser.add_argument(
+        "--plan", action="store_true", help="label a short sample only, and say what all of it will cost"
     )
     parser.add_argument("--rounds", type=int, default=1, metavar="N", help="of labelling, training and validation")
     parser.add_argument(
@@ -39,6 +51,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="SEQUENCE",
         help="held out for validation (default: one sequence in five, or the last fifth of a single one)",
+    )
+    parser.add_argument(
+        "--after",
+        type=Path,
+        metavar="FOLDER",
+        help="finished OUT of an earlier run: starts from its weights; recordings that it had are replayed and must "
+        "not get worse, the others are new",
     )
     add_job_arguments(parser)
     add_data_card(parser)
@@ -88,8 +107,13 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.rounds < 1:
         raise ConfigError(f"--rounds {arguments.rounds}: must be at least 1")
     settings = settings_from(ImproveSettings, arguments, extra=_of_both_recipes(arguments))
-    check_output_folder(arguments.output, "improve")
     check_recordings(arguments.sequences)
+    check_frontend(settings.frontend.name)
+    if arguments.plan:
+        return _plan(arguments, settings)
+    if arguments.output is None:
+        raise ConfigError("-o OUT: is missing; it is the folder of the results")
+    check_output_folder(arguments.output, "improve")
     data = read_data_card(arguments.data_card)
     need_torch()
     recordings = [*arguments.sequences, *arguments.evaluate]
@@ -112,6 +136,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.ray,
         data,
         ImprovementProgress(say, shown=not output.as_json()),
+        after=arguments.after,
     )
     kept = result.candidates[result.best].name
     figures({"weights": str(result.weights), "best": result.best, "kept": kept}, "")
@@ -126,4 +151,18 @@ def run(arguments: argparse.Namespace) -> int:
     say(f"weights in {result.weights}")
     say(f"report in {arguments.output / 'report.html'}")
     next_step(f"`improvo run SEQUENCE --frontend {result.weights} -o out` uses them")
+    return 0
+
+
+def _plan(arguments: argparse.Namespace, settings: ImproveSettings) -> int:
+    """Measure a sample; nothing is left."""
+    from improvo.improvement.plan import plan_improvement
+    from improvo.odometry.compile import compile_odometry
+    from improvo.terminal import progress
+
+    compile_odometry(notice)
+    with progress("sample", "frame") as shown:
+        plan = plan_improvement(arguments.sequences, settings, arguments.rounds, arguments.evaluate, shown.advance)
+    say_improve_plan(plan, arguments.rounds)
+    next_step("the same without --plan and with -o OUT does it")
     return 0

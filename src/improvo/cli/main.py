@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from improvo import __version__
+from improvo import __version__, locations
 from improvo.cli import output
 from improvo.cli.commands import COMMANDS, Command
 from improvo.errors import ImprovoError
@@ -18,7 +18,8 @@ from improvo.jobs.interrupts import termination_interrupts
 
 _EPILOG = """\
 `improvo VERB --help` shows a command's options with their defaults.
-Exit status: 0 done, 2 an error that you can correct (one line says how), 130 interrupted, 1 a bug of improvo."""
+Exit status: 0 done, 2 an error that you can correct (one line says how), 3 done, but no frame has a pose,
+130 interrupted, 1 a bug of improvo."""
 
 
 class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
@@ -50,11 +51,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = parser_for(words).parse_args(words)
         _check_paths(arguments)
         with output.configured(arguments.quiet, getattr(arguments, "json", False)), termination_interrupts():
-            return int(arguments.run_command(arguments) or 0)
+            status = int(arguments.run_command(arguments) or 0)
+            locations.close()
+            return status
     except ImprovoError as error:
-        print(f"improvo: {error}", file=sys.stderr)
+        print(f"improvo: {locations.with_urls(str(error))}", file=sys.stderr)
+        locations.close(success=False)
         return 2
     except KeyboardInterrupt:
+        locations.close(success=False)
         print("improvo: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
@@ -87,6 +92,15 @@ def cache_folder() -> Path:
 
 def parser_for(words: Sequence[str]) -> argparse.ArgumentParser:
     """The parser of all commands; only the module of the one that `words` name is imported."""
+    return _parser([word for word in words if not word.startswith("-")][:2])
+
+
+def whole_parser() -> argparse.ArgumentParser:
+    """The parser with the options of all commands, which imports the modules of all."""
+    return _parser(None)
+
+
+def _parser(named: list[str] | None) -> argparse.ArgumentParser:
     parser = _Parser(
         prog="improvo",
         description="Self-improving visual odometry: video in; a trajectory, a map and a better frontend out.",
@@ -94,21 +108,24 @@ def parser_for(words: Sequence[str]) -> argparse.ArgumentParser:
         formatter_class=_Text,
     )
     parser.add_argument("--version", action="version", version=f"improvo {__version__}")
-    named = [word for word in words if not word.startswith("-")][:2]
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
     _add_commands(verbs, COMMANDS, named)
     return parser
 
 
-def _add_commands(parsers: argparse._SubParsersAction[_Parser], commands: dict[str, Command], named: list[str]) -> None:
+def _add_commands(
+    parsers: argparse._SubParsersAction[_Parser], commands: dict[str, Command], named: list[str] | None
+) -> None:
+    """Add the commands, with the options of the one that is named, or of all where that is None."""
     for name, command in commands.items():
-        chosen = named[:1] == [name]
+        chosen = named is None or named[:1] == [name]
         leaf = chosen and not command.parts
         description = command.description() if leaf else command.help
         parser = parsers.add_parser(name, help=command.help, description=description, formatter_class=_Text)
         if command.parts:
             parts = parser.add_subparsers(dest="part", metavar=command.part_name, required=True)
-            _add_commands(parts, dict(command.parts), named[1:] if chosen else [])
+            below = None if named is None else named[1:] if chosen else []
+            _add_commands(parts, dict(command.parts), below)
         elif leaf:
             from improvo.cli.options import add_preset_argument
 

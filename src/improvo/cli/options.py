@@ -47,11 +47,12 @@ def add_sequence_arguments(
         add_setting(group, defaults, f"--{name.replace('_', '-')}", name, section="sequence.", **options)
 
 
-def add_frontend_arguments(parser: argparse.ArgumentParser, defaults: Any) -> None:
+def add_frontend_arguments(parser: argparse.ArgumentParser, defaults: Any, seed: str = "odometry.seed") -> None:
     """Which frontend, how many keypoints, how a network runs, and the seed.
 
     Args:
-        defaults: settings with the sections `frontend` and `odometry`.
+        defaults: settings with the section `frontend`.
+        seed: the setting that `--seed` stands for.
     """
     add_setting(parser, defaults, "--frontend", "frontend.name", metavar="NAME")
     add_setting(parser, defaults, "--max-keypoints", "frontend.max_keypoints")
@@ -61,7 +62,7 @@ def add_frontend_arguments(parser: argparse.ArgumentParser, defaults: Any) -> No
     )
     add_setting(parser, defaults, "--device", f"{network}.device", help="of a network; cuda needs the extra `train`")
     add_setting(parser, defaults, "--precision", f"{network}.precision", help="of a network")
-    add_setting(parser, defaults, "--seed", "odometry.seed", help="of all random choices")
+    add_setting(parser, defaults, "--seed", seed, help="of all random choices")
 
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
@@ -85,6 +86,20 @@ def recording_path(text: str) -> Path:
     from improvo.simulation import bundled_sequence
 
     return bundled_sequence()
+
+
+def folder_path(text: str) -> Path:
+    """The type of an argument that names a folder to write in, here or at a location such as `s3://bucket/folder`."""
+    from improvo.locations import local_folder
+
+    return local_folder(text)
+
+
+def read_folder_path(text: str) -> Path:
+    """As `folder_path`, of a folder that is only read."""
+    from improvo.locations import local_folder
+
+    return local_folder(text, writing=False)
 
 
 def check_recordings(paths: list[Path]) -> None:

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from improvo import terminal
+from improvo.locations import with_urls
 
 _silent = False  # no lines for people
 _as_json = False
@@ -59,6 +60,7 @@ def as_json() -> bool:
 
 def _line(text: str) -> None:
     """Print past the progress bars, where there are any."""
+    text = with_urls(text)
     if "tqdm" not in sys.modules:
         print(text, flush=True)
         return

@@ -16,6 +16,7 @@ from improvo.cli.options import (
     add_config_arguments,
     add_frontend_arguments,
     add_sequence_arguments,
+    folder_path,
     recording_path,
     settings_from,
 )
@@ -23,6 +24,7 @@ from improvo.cli.output import figures, next_step, notice, say
 from improvo.depth.run_settings import DenseRunSettings
 from improvo.errors import InputError
 from improvo.odometry.scale.settings import USAGE, scale_settings
+from improvo.terminal import counted
 
 if TYPE_CHECKING:
     from improvo.labeling.labeler import LabeledRun
@@ -31,7 +33,9 @@ if TYPE_CHECKING:
     from improvo.odometry.visualizer import Visualizer
     from improvo.sequences import Sequence
 
+NO_RESULT = 3  # exit status where everything was read, and no frame has a pose
 _WARNINGS = 5  # printed; run.json has them all
+_UNSAID = ("initialising", "segment", "doubtful", "uncertain")  # kinds of events that other lines say
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "sequence", type=recording_path, metavar="SEQUENCE", help="a video, an image folder, a data set, or `demo`"
     )
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder for the results")
+    parser.add_argument("-o", "--output", type=folder_path, required=True, metavar="OUT", help="folder for the results")
     add_frontend_arguments(parser, defaults)
     add_setting(parser, defaults, "--mode", "odometry.mode", choices=("robust", "paper"))
     parser.add_argument(
@@ -65,14 +69,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Track the sequence and write the results; 130 after an interrupt."""
+    """Track the sequence and write the results; 130 after an interrupt, 3 where no frame has a pose."""
     extra = ["frontend.use_stability=false"] if arguments.no_stability else []
     extra += ["dense=true"] if arguments.dense else []
     extra += scale_settings(arguments.scale) if arguments.scale else []
     settings = settings_from(DenseRunSettings, arguments, extra=extra)
     from improvo.files import check_output_folder
+    from improvo.folder_lock import working_in
+    from improvo.frontend.registry import check_frontend
     from improvo.sequences import open_sequence
 
+    check_frontend(settings.frontend.name, settings.frontend.network)
     check_output_folder(arguments.output, "run")
     settings = with_found_camera(settings, [arguments.sequence], arguments.output, "run")
     sequence = open_sequence(arguments.sequence, settings.sequence)
@@ -81,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         refuse_live(sequence)
     camera = sequence.camera
-    frames = "live, Ctrl-C ends it: frames" if sequence.length is None else f"{sequence.length} frames"
+    frames = "live, Ctrl-C ends it: frames" if sequence.length is None else counted(sequence.length, "frame")
     say(
         f"{sequence.name}: {sequence.format}, {frames} of {camera.width}x{camera.height}; "
         f"frontend {settings.frontend.name}; poses and map are "
@@ -90,6 +97,12 @@ def run(arguments: argparse.Namespace) -> int:
     for note in sequence.notes:
         say(f"note: {note}")
     ask = _scale_source(sequence, settings)
+    with working_in(arguments.output, "run"):
+        return _tracked(arguments, sequence, settings, ask)
+
+
+def _tracked(arguments: argparse.Namespace, sequence: Sequence, settings: DenseRunSettings, ask: Ask | None) -> int:
+    """Everything that is written; 130 after an interrupt."""
     summary = _track(sequence, arguments.output, settings, _viewer(arguments))
     if ask is not None:
         summary = _in_metres(sequence, summary, ask, settings)
@@ -102,14 +115,16 @@ def run(arguments: argparse.Namespace) -> int:
         from improvo.report.pages import write_report
 
         write_report(arguments.output, arguments.output / "report.html")
-        say(f"page in {arguments.output / 'report.html'}")
+        next_step(f"open {arguments.output / 'report.html'}, or draw `improvo show labels {arguments.output}`")
     elif summary.tracked:
         next_step(
             f"`improvo report {summary.folder}` makes a page of it, `improvo show map {summary.folder}` a picture"
         )
     else:
         next_step(f"`improvo info {arguments.sequence}` looks for what is wrong with the recording")
-    return 130 if interrupted else 0
+    if interrupted:
+        return 130
+    return 0 if summary.tracked else NO_RESULT
 
 
 def _viewer(arguments: argparse.Namespace) -> Visualizer | None:
@@ -170,7 +185,7 @@ def _add_depth(sequence: Sequence, summary: LabeledRun, settings: DenseRunSettin
     with progress("depth", "frame", summary.tracked) as shown:
         entry = write_dense(sequence, summary, settings.depth, shown.advance)
     say(
-        f"depth of {entry['frames']} frames in depth.zip, {100 * entry['share']:.0f} % of their pixels; "
+        f"depth of {counted(entry['frames'], 'frame')} in depth.zip, {100 * entry['share']:.0f} % of their pixels; "
         f"{entry['points']} points in dense.ply"
     )
     return bool(entry["interrupted"])
@@ -191,7 +206,7 @@ def _scale_lines(report: dict[str, Any]) -> list[str]:
         error, change = entry["relative_error"], entry["change"]
         text = f"segment {entry['segment']}: {entry['metres_per_unit']:.5g} m a unit"
         text += "" if error is None else f", ±{100 * error:.2g} %"
-        text += f", by {entry['measurements']} measurement(s)"
+        text += f", by {counted(entry['measurements'], 'measurement')}"
         text += "" if change is None else f"; {100 * change:+.1f} % from its first to its last third"
         lines.append(text)
     return lines
@@ -199,26 +214,29 @@ def _scale_lines(report: dict[str, Any]) -> list[str]:
 
 def _print_summary(summary: LabeledRun) -> None:
     from improvo.odometry.run_folder import why_no_pose
+    from improvo.odometry.told_verdicts import verdict_lines
 
     report = summary.report
     frames, segments = report["frames"], report["segments"]
     say(
-        f"{frames['tracked']} of {frames['processed']} frames have a pose, in {len(segments)} segment(s); "
-        f"{report['points']} points; {report['frames_per_second']} frames/s"
+        f"{frames['tracked']} of {counted(frames['processed'], 'frame')} have a pose, in "
+        f"{counted(len(segments), 'segment')}; "
+        f"{counted(report['points'], 'point')}; {report['frames_per_second']} frames/s"
     )
     for segment in segments[1:] if len(segments) > 1 else []:
         own = "" if report.get("metric") else "own scale, "
         say(f"  segment {segment['number']} starts at frame {segment['first']}: {own}placed by guess")
-    for line in _scale_lines(report):
+    for line in [*verdict_lines(report), *_scale_lines(report)]:
         say(f"  {line}")
-    warnings = [event for event in report["events"] if event["kind"] in ("lost", "contradiction")]
+    warnings = [event for event in report["events"] if event["kind"] not in _UNSAID]
     for event in warnings[:_WARNINGS]:
         say(f"  frame {event['frame_index']}: {event['kind']}: {event['detail']}")
     if len(warnings) > _WARNINGS:
         say(f"  ... {len(warnings) - _WARNINGS} more in run.json")
     skipped = report["input"]["skipped"]
     if skipped:
-        say(f"  {len(skipped)} frame(s) could not be read, first {skipped[0]['source']}: {skipped[0]['reason']}")
+        first = skipped[0]
+        say(f"  {counted(len(skipped), 'frame')} could not be read, first {first['source']}: {first['reason']}")
     if report["interrupted"]:
         say("  interrupted: the result ends there, and is complete up to there")
     without = why_no_pose(report)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from improvo.cli.output import say
 from improvo.errors import ConfigError, OutputError
+from improvo.terminal import counted
 
 if TYPE_CHECKING:
     from improvo.odometry.run_folder import RunFolder
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 _EVENLY = "6"  # frames of a sheet
 _MANY = 20  # frames that deserve a progress bar
 _LARGEST_SHEET = 60  # frames; more become files of their own
+MOVING = (".mp4", ".webm", ".gif", ".webp")  # suffixes of `improvo.report.sheets`, which loads more
 
 
 def add_run_folder(parser: argparse.ArgumentParser, made_by: str = "run") -> None:
@@ -49,14 +51,36 @@ def add_frames(parser: argparse.ArgumentParser) -> None:
         "--frames", default=_EVENLY, metavar="WHICH", help="`all`, a list such as 10,50,90, or N for N spread evenly"
     )
     parser.add_argument("--each", action="store_true", help="one PNG per frame, not one sheet")
-    parser.add_argument("--video", action="store_true", help="one MP4 (of all frames, unless --frames says else)")
+    parser.add_argument(
+        "--video",
+        action="store_true",
+        help="one MP4 (of all frames, unless --frames says else); as does -o FILE.mp4, .webm, .gif or .webp",
+    )
     parser.add_argument("--video-fps", type=float, metavar="FPS", help="of the video (default: as recorded)")
+    parser.add_argument("--video-width", type=int, metavar="PIXELS", help="of the video (default: of the pictures)")
 
 
 def asked_frames(arguments: argparse.Namespace, count: int) -> list[int]:
-    """The frames that the arguments of `add_frames` name, of `count`."""
-    which = "all" if arguments.video and arguments.frames == _EVENLY else arguments.frames
-    return chosen_frames(which, count)
+    """The frames that the arguments of `add_frames` name, of `count`; what they say of the output is checked too."""
+    video = _is_video(arguments)
+    which = "all" if video and arguments.frames == _EVENLY else arguments.frames
+    frames = chosen_frames(which, count)
+    output: Path | None = arguments.output
+    if arguments.video_width is not None and arguments.video_width < 16:
+        raise ConfigError(f"--video-width {arguments.video_width}: must be at least 16 pixels")
+    if output is None or not output.suffix or video:
+        return frames
+    if arguments.each or len(frames) > _LARGEST_SHEET:
+        raise OutputError(
+            f"{output}: {counted(len(frames), 'picture')} {'is' if len(frames) == 1 else 'are'} a file each; name a "
+            f"folder, or a video (.mp4), or at most {_LARGEST_SHEET} frames for one sheet"
+        )
+    return frames
+
+
+def _is_video(arguments: argparse.Namespace) -> bool:
+    output: Path | None = arguments.output
+    return bool(arguments.video or (output is not None and output.suffix.lower() in MOVING))
 
 
 def chosen_frames(which: str, count: int) -> list[int]:
@@ -134,9 +158,9 @@ def write_pictures(
             return paint(frame)
 
         pictures = map(painted, frames)
-        if arguments.video:
+        if _is_video(arguments):
             target = target_path(arguments.output, default_folder, f"{name}.mp4")
-            write_video(target, pictures, arguments.video_fps or fps)
+            write_video(target, pictures, arguments.video_fps or fps, arguments.video_width)
         elif arguments.each or len(frames) > _LARGEST_SHEET:
             target = target_path(arguments.output, default_folder, name)
             for frame, picture in zip(frames, pictures, strict=True):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from improvo.cli.auto_camera import with_found_camera
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import next_step, say
 from improvo.cli.show_options import (
     add_frames,
@@ -75,10 +75,13 @@ def run_matches(arguments: argparse.Namespace) -> None:
     import numpy as np
 
     from improvo.files import write_png
-    from improvo.frontend.registry import load_frontend
+    from improvo.frontend.registry import check_frontend, load_frontend
     from improvo.report.match_picture import paint_matches
     from improvo.report.palettes import palette
 
+    names = arguments.frontends.split(",")
+    for name in names:
+        check_frontend(name)
     sequence, _ = _opened_sequence(arguments)
     pair = chosen_frames(arguments.pair, len(sequence))
     if len(pair) != 2 or "," not in arguments.pair:
@@ -95,7 +98,7 @@ def run_matches(arguments: argparse.Namespace) -> None:
             palette(arguments.palette),
             masks=(frame_a.mask, frame_b.mask),
         )
-        for name in arguments.frontends.split(",")
+        for name in names
     ]
     target = target_path(arguments.output, Path(), "matches.png")
     write_png(target, np.concatenate(rows))
@@ -104,7 +107,7 @@ def run_matches(arguments: argparse.Namespace) -> None:
 
 
 def _add_recording(parser: argparse.ArgumentParser, default: str) -> None:
-    parser.add_argument("sequence", type=Path, metavar="SEQUENCE", help="a recording, or the folder of a run")
+    parser.add_argument("sequence", type=recording_path, metavar="SEQUENCE", help="a recording, or the folder of a run")
     add_target(parser, default)
     add_palette(parser)
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from improvo.cli.flags import add_setting
-from improvo.cli.options import settings_from
+from improvo.cli.options import read_folder_path, settings_from
 from improvo.cli.train_options import (
     add_data_card,
     add_training_arguments,
@@ -86,7 +85,7 @@ def run_homographies(arguments: argparse.Namespace) -> None:
 def add_odometry_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `improvo train odometry`."""
     parser.add_argument(
-        "labels", nargs="+", type=Path, metavar="LABELS", help="label stores, as `improvo label` makes them"
+        "labels", nargs="+", type=read_folder_path, metavar="LABELS", help="label stores, as `improvo label` makes them"
     )
     parser.add_argument(
         "--pictures",

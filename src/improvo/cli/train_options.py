@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from improvo.cli.flags import add_setting
-from improvo.cli.options import add_config_arguments
+from improvo.cli.options import add_config_arguments, folder_path
 from improvo.cli.output import figures, next_step, say
 from improvo.errors import InputError
 from improvo.untrusted.text import load_json, reason
@@ -25,7 +25,7 @@ def add_training_arguments(parser: argparse.ArgumentParser, defaults: Any, paren
         parent: the weights that the stage starts from by default; their architecture is kept. None starts anew.
     """
     parser.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="OUT", help="folder; an unfinished one is continued"
+        "-o", "--output", type=folder_path, required=True, metavar="OUT", help="folder; an unfinished one is continued"
     )
     parser.add_argument(
         "--from",

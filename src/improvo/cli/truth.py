@@ -13,7 +13,7 @@ from pathlib import Path
 from improvo import terminal
 from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.evaluate_options import available_cores
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import figures, next_step
 from improvo.evaluation.truth.settings import CALIBRATE, TruthCommandSettings, TruthSettings
 
@@ -23,7 +23,7 @@ _FLAGS = {"calibrate": "truth.calibrate", "max_features": "truth.max_features", 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `improvo truth`."""
     defaults, absent = TruthSettings(), argparse.SUPPRESS
-    parser.add_argument("sequence", type=Path, metavar="SEQUENCE")
+    parser.add_argument("sequence", type=recording_path, metavar="SEQUENCE")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", required=True, help="poses and camera")
     parser.add_argument("--scale-from", metavar="POSES", help="poses in metres, where the recording has no depth")
     parser.add_argument("--model", type=Path, metavar="DIR", help="a COLMAP model, instead of making one")

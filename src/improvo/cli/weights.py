@@ -1,4 +1,4 @@
-"""`improvo weights import / calibrate / show`: weights files in, prepared, and read."""
+"""`improvo weights import / export / calibrate / show`: weights files in, out, prepared, and read."""
 
 from __future__ import annotations
 
@@ -11,12 +11,34 @@ from improvo.cli.output import next_step, say
 from improvo.errors import InputError, OutputError
 from improvo.types import UInt8
 
+_CONSUMERS = {
+    "original": "load {output} where a program wants `superpoint_v1.pth`",
+    "rpautrat": "`SuperPoint().load_state_dict(torch.load('{output}'))` with that program's class",
+    "transformers": "`SuperPointForKeypointDetection.from_pretrained('{output}')`",
+}
+
 
 def add_import_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `improvo weights import`."""
     parser.add_argument("file", type=Path, metavar="FILE")
     parser.add_argument("-o", "--output", type=Path, default=Path("weights.safetensors"), help="file to write")
     parser.add_argument("--licence", default="", help="of the file, for the model card")
+
+
+def add_export_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `improvo weights export`."""
+    from improvo.export.weights_layouts import NAMES
+
+    _add_weights(parser)
+    parser.add_argument("--layout", choices=NAMES, required=True, help="original: LightGlue, hloc, SuperGlue, pySLAM")
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help=".pth (needs the extra `train`) or .safetensors; a new folder for transformers",
+    )
 
 
 def add_calibrate_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,6 +76,35 @@ def run_import(arguments: argparse.Namespace) -> None:
             "record them with --licence."
         )
     next_step(f"`improvo run SEQUENCE --frontend {output} -o out` uses them")
+
+
+def run_export(arguments: argparse.Namespace) -> None:
+    """Weights in the layout of a public SuperPoint implementation, which loads them and computes the same.
+
+    The move of keypoints to the image's corners is no part of a network, so others leave it out.
+    """
+    from improvo.export.weights_layouts import export_weights, left_out
+    from improvo.files import check_output_folder
+    from improvo.frontend.weights import find_weights, load_weights
+
+    output: Path = arguments.output
+    if arguments.layout == "transformers":
+        check_output_folder(output, "weights export")
+    else:
+        _check_new(output)
+    weights = load_weights(find_weights(arguments.weights))
+    export_weights(weights, arguments.layout, output)
+    width = weights.architecture.descriptor
+    dimensions = width if arguments.layout == "transformers" else 256
+    padded = f", the last {dimensions - width} of them 0" if width < dimensions else ""
+    say(f"{arguments.weights} -> {output}: layout {arguments.layout}, descriptors of {dimensions} numbers{padded}")
+    for part in left_out(weights):
+        say(f"left out, since the layout has no place for it: {part}")
+    say(
+        "a matcher that was trained on other descriptors (SuperGlue, LightGlue) does not fit these; match by nearest "
+        "neighbours"
+    )
+    next_step(_CONSUMERS[arguments.layout].format(output=output))
 
 
 def run_calibrate(arguments: argparse.Namespace) -> None:
@@ -114,8 +165,12 @@ def _pictures(place: Path) -> list[Path]:
 def _checked_output(path: Path) -> Path:
     if path.suffix != ".safetensors":
         raise OutputError(f"{path}: weights are written as .safetensors; name the output so")
+    _check_new(path)
+    return path
+
+
+def _check_new(path: Path) -> None:
     if path.exists() or path.with_suffix(".json").exists():
         raise OutputError(f"{path}: it or its .json exists already; choose another file with -o")
     if not path.parent.is_dir():
         raise OutputError(f"{path}: no folder {path.parent}; make it first")
-    return path

@@ -7,10 +7,15 @@ from dataclasses import dataclass, field
 
 from improvo.errors import ConfigError
 from improvo.geometry.depth_sampling import SAMPLINGS
+from improvo.geometry.ransac import poselib_installed
 from improvo.odometry.settings import OdometrySettings
 from improvo.sequences.base import SequenceSettings
 
-ESTIMATORS = ("opencv", "poselib")
+ESTIMATORS = ("opencv", "poselib", "usac")
+DEFAULT_ESTIMATORS = ("opencv", "poselib" if poselib_installed() else "usac")
+
+# what frames of `redkitchen` (30 Hz) show of each other 30, 60 and 90 frames apart, in the median
+USUAL_OVERLAPS = (0.8, 0.6, 0.45)
 
 ALIGNMENTS = ("sim3", "se3", "none")
 
@@ -20,9 +25,11 @@ class PoseSettings:
     """The pose protocol; the defaults are the paper's."""
 
     gaps: tuple[int, ...] = (30, 60, 90)  # frames between A and B, as delivered (after any stride)
+    gap_seconds: tuple[float, ...] = ()  # in place of `gaps`: seconds between A and B
+    overlaps: tuple[float, ...] = ()  # in place of `gaps`: shares of A that B shows too, the largest first
     pairs: int = 50  # random pairs per sequence and gap
     max_keypoints: int = 500
-    estimators: tuple[str, ...] = ESTIMATORS  # opencv is the paper's solver, poselib a robust one
+    estimators: tuple[str, ...] = DEFAULT_ESTIMATORS  # opencv is the paper's; poselib, usac (OpenCV's) are robust
     seed: int = 0  # of the pairs, the robust solver and the intervals
     max_rotation_deg: float = 5.0  # success is strictly below
     max_translation_m: float = 0.05  # success is strictly below
@@ -39,11 +46,22 @@ class PoseSettings:
     def __post_init__(self) -> None:
         if not self.gaps or min(self.gaps) < 1 or len(set(self.gaps)) < len(self.gaps):
             raise ConfigError(f"gaps {list(self.gaps)}: give different numbers of frames, each 1 or more")
+        if self.gap_seconds and self.overlaps:
+            raise ConfigError("gap_seconds and overlaps: give one of them")
+        if not all(math.isfinite(each) and each > 0 for each in self.gap_seconds):
+            raise ConfigError(f"gap_seconds {list(self.gap_seconds)}: must be positive")
+        falling = list(self.overlaps) == sorted(set(self.overlaps), reverse=True)
+        if not falling or not all(0 < each < 1 for each in self.overlaps):
+            raise ConfigError(
+                f"overlaps {list(self.overlaps)}: give shares below 1, the largest first, such as 0.8 0.6"
+            )
         if min(self.pairs, self.resamples, self.shuffles) < 1 or self.max_keypoints < 4:
             raise ConfigError("pairs, resamples and shuffles must be at least 1, max_keypoints at least 4")
         unknown = set(self.estimators) - set(ESTIMATORS)
         if unknown or not self.estimators:
             raise ConfigError(f"estimators {list(self.estimators)}: choose among {', '.join(ESTIMATORS)}")
+        if "poselib" in self.estimators and not poselib_installed():
+            raise ConfigError("estimators: PoseLib is not installed here; choose usac, or pip install poselib")
         if self.depth_sampling not in SAMPLINGS:
             raise ConfigError(f"depth_sampling `{self.depth_sampling}` is unknown; choose among {', '.join(SAMPLINGS)}")
         limits = (self.max_rotation_deg, self.max_translation_m, self.max_error_px, self.depth_edge)

@@ -1,163 +1,94 @@
-"""A network with its decoding as one ONNX file, for programs that use ONNX Runtime without improvo."""
+"""A network with its decoding as one ONNX file, for programs that use ONNX Runtime, or OpenCV 5, without improvo."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from improvo import config, files
-from improvo.errors import MissingExtraError
-from improvo.frontend.architecture import CELL, POOL_AFTER
+from improvo.frontend.architecture import CELL
 from improvo.frontend.channel_pruning import without_dead_channels
+from improvo.frontend.onnx_graph import NetworkNodes, OnnxGraph, add_heat_map
 from improvo.frontend.settings import NetworkSettings
-from improvo.frontend.weights import FoldedLayer, Weights
-
-OPSET = 17
-IR_VERSION = 8  # the oldest that holds this opset: readable by ONNX Runtime 1.13 and later
+from improvo.frontend.weights import Weights
 
 
-def export_onnx(weights: Weights, path: Path, settings: NetworkSettings) -> None:
+def export_onnx(weights: Weights, path: Path, settings: NetworkSettings, layout: str = "improvo") -> None:
     """Write an ONNX model that gives what `NetworkFrontend` gives, for a batch of images of any one size.
 
     Input `image` (batch, 1, height, width) float32 in [0, 1]. Outputs, with N = `settings.max_keypoints`:
     `keypoints` (batch, N, 2) x, y; `scores` (batch, N), best first; `descriptors` (batch, N, D); `stability` (batch, N)
     where there is such a head; `valid` (batch, N) bool, False on the rows past the last keypoint, which mean nothing.
 
+    With the layout `opencv` it is what `cv2.ALIKED` of OpenCV 5 loads (`export/onnx_opencv.py`).
+
     Raises:
         MissingExtraError: the package onnx is not installed.
         OutputError: the file cannot be written.
     """
-    try:
-        import onnx
-        from onnx import helper
-    except ImportError:
-        raise MissingExtraError("exporting ONNX", "onnx") from None
+    graph = OnnxGraph("exporting ONNX")
+    import onnx
 
-    graph = _Graph(helper, onnx.numpy_helper)
-    outputs = _build(graph, without_dead_channels(weights), settings)
-    float32, boolean = onnx.TensorProto.FLOAT, onnx.TensorProto.BOOL
-    count, width = settings.max_keypoints, weights.architecture.descriptor
-    tails: dict[str, list[int]] = {"keypoints": [count, 2], "descriptors": [count, width]}
-    model = helper.make_model(
-        helper.make_graph(
-            graph.nodes,
-            weights.architecture.name,
-            [helper.make_tensor_value_info("image", float32, ["batch", 1, "height", "width"])],
-            [
-                helper.make_tensor_value_info(
-                    name, boolean if name == "valid" else float32, ["batch", *tails.get(name, [count])]
-                )
-                for name in outputs
-            ],
-            graph.constants,
-        ),
-        opset_imports=[helper.make_opsetid("", OPSET)],
-        ir_version=IR_VERSION,
-        producer_name="improvo",
-    )
+    from improvo.export import onnx_opencv
+
+    width = weights.architecture.descriptor
+    for_opencv = layout == "opencv"
+    image = onnx_opencv.grey(graph) if for_opencv else "image"
+    outputs = _build(graph, without_dead_channels(weights), settings, image)
+    shapes = onnx_opencv.SHAPES if for_opencv else _shapes(settings.max_keypoints)
+    for name, node in (onnx_opencv.outputs(graph, outputs) if for_opencv else outputs).items():
+        graph.node("Identity", node, name=name)
+    described_outputs = {
+        name: (name == "valid", [width if side == "width" else side for side in shapes[name]])
+        for name in (shapes if for_opencv else outputs)
+    }
+    size: list[int | str] = [1, 3, "height", "width"] if for_opencv else ["batch", 1, "height", "width"]
+    model = graph.model(weights.architecture.name, described_outputs, size)
     described = {"model_card": config.to_dict(weights.card), "settings": config.to_dict(settings)}
-    helper.set_model_props(model, {name: json.dumps(value) for name, value in described.items()})
+    onnx.helper.set_model_props(model, {name: json.dumps(value) for name, value in described.items()})
     onnx.checker.check_model(model, full_check=True)
     with files.written_atomically(path) as temporary:
         onnx.save(model, temporary)
 
 
-class _Graph:
-    """Collects nodes and constants; `node` and `constant` return the name of what they add."""
-
-    def __init__(self, helper: Any, numpy_helper: Any) -> None:
-        self.nodes: list[Any] = []
-        self.constants: list[Any] = []
-        self._helper, self._numpy_helper = helper, numpy_helper
-
-    def node(self, kind: str, *inputs: str, name: str | None = None, outputs: int = 1, **attributes: Any) -> Any:
-        names = [name or f"{kind}_{len(self.nodes)}"] if outputs == 1 else []
-        names = names or [f"{kind}_{len(self.nodes)}_{number}" for number in range(outputs)]
-        self.nodes.append(self._helper.make_node(kind, list(inputs), names, **attributes))
-        return names[0] if outputs == 1 else names
-
-    def constant(self, values: NDArray[Any] | Sequence[int]) -> str:
-        name = f"constant_{len(self.constants)}"
-        self.constants.append(self._numpy_helper.from_array(np.asarray(values), name))
-        return name
-
-    def number(self, value: float) -> str:
-        return self.constant(np.array(value, np.float32))
-
-    def slice(self, node: str, axes: Sequence[int], starts: str, ends: str) -> str:
-        return str(self.node("Slice", node, starts, ends, self.constant(np.array(axes))))
+def _shapes(count: int) -> dict[str, tuple[int | str, ...]]:
+    """Of the outputs, by name; `width` is that of a descriptor."""
+    shapes: dict[str, tuple[int | str, ...]] = {"keypoints": ("batch", count, 2)}
+    shapes["descriptors"] = ("batch", count, "width")
+    return shapes | dict.fromkeys(("scores", "stability", "valid"), ("batch", count))
 
 
-def _build(graph: _Graph, weights: Weights, settings: NetworkSettings) -> list[str]:
-    """The whole model; returns the names of its outputs."""
-    size = graph.slice(graph.node("Shape", "image"), [0], graph.constant([2]), graph.constant([4]))  # height, width
+def _build(graph: OnnxGraph, weights: Weights, settings: NetworkSettings, image: str) -> dict[str, str]:
+    """The whole model from a grey `image` (batch, 1, height, width); the nodes of its outputs by name."""
+    size = graph.slice(graph.node("Shape", image), [0], graph.constant([2]), graph.constant([4]))  # height, width
     width = graph.slice(size, [0], graph.constant([1]), graph.constant([2]))
     padding = graph.node("Mod", graph.node("Neg", size), graph.constant([CELL]))
     padded_size = graph.node("Add", size, padding)
     pads = graph.node("Concat", graph.constant([0] * 6), padding, axis=0)
-    maps = _network(graph, weights, graph.node("Pad", "image", pads, mode="edge"))
+    maps = NetworkNodes(graph, weights).add(graph.node("Pad", image, pads, mode="edge"))
 
-    heat = graph.slice(_heat_map(graph, maps["detector"]), [2, 3], graph.constant([0, 0]), size)
+    heat = graph.slice(add_heat_map(graph, maps["detector"]), [2, 3], graph.constant([0, 0]), size)
     scores, index = _best_pixels(graph, heat, size, settings)
     row, column = graph.node("Div", index, width), graph.node("Mod", index, width)
     pixels = [graph.node("Unsqueeze", axis, graph.constant([2])) for axis in (column, row)]
     keypoints = graph.node("Cast", graph.node("Concat", *pixels, axis=2), to=1)
     if settings.subpixel_radius:
         keypoints = graph.node("Add", keypoints, _offsets(graph, heat, size, index, settings.subpixel_radius))
-    graph.node("Identity", keypoints, name="keypoints")
-    graph.node("Identity", scores, name="scores")
-    graph.node("Greater", scores, graph.number(0), name="valid")
-
+    outputs = {"keypoints": str(keypoints), "scores": scores}
     grid = _sampling_grid(graph, keypoints, padded_size)
     cells = graph.node("LpNormalization", maps["descriptor"], axis=1, p=2)
-    graph.node("LpNormalization", _sample(graph, cells, grid), axis=2, p=2, name="descriptors")
-    outputs = ["keypoints", "scores", "descriptors", "valid"]
+    outputs["descriptors"] = graph.node("LpNormalization", _sample(graph, cells, grid), axis=2, p=2)
     if "stability" in maps:
         probabilities = graph.node("Softmax", _sample(graph, maps["stability"], grid), axis=2)
         stable = graph.slice(probabilities, [2], graph.constant([1]), graph.constant([2]))
-        graph.node("Squeeze", stable, graph.constant([2]), name="stability")
-        outputs.insert(3, "stability")
+        outputs["stability"] = graph.node("Squeeze", stable, graph.constant([2]))
+    outputs["valid"] = graph.node("Greater", scores, graph.number(0))
     return outputs
 
 
-def _network(graph: _Graph, weights: Weights, image: str) -> dict[str, str]:
-    """Raw output of every head."""
-    layers = {layer.convolution.name: layer for layer in weights.folded()}
-    shared = image
-    for number in range(len(weights.architecture.encoder)):
-        shared = _convolution(graph, layers[f"encoder.{number}"], shared)
-        if number in POOL_AFTER:
-            shared = graph.node("MaxPool", shared, kernel_shape=[2, 2], strides=[2, 2])
-    heads = weights.architecture.heads
-    first = {head: _convolution(graph, layers[f"{head}.0"], shared) for head in heads}
-    return {head: _convolution(graph, layers[f"{head}.1"], first[head]) for head in heads}
-
-
-def _convolution(graph: _Graph, layer: FoldedLayer, node: str) -> str:
-    pad = layer.convolution.kernel // 2
-    weight, bias = graph.constant(layer.weight), graph.constant(layer.bias)
-    node = graph.node("Conv", node, weight, bias, pads=[pad] * 4)
-    if layer.convolution.kernel == 1:
-        return node
-    node = graph.node("Relu", node)
-    if layer.scale is not None and layer.shift is not None:
-        node = graph.node("Mul", node, graph.constant(layer.scale.reshape(1, -1, 1, 1)))
-        node = graph.node("Add", node, graph.constant(layer.shift.reshape(1, -1, 1, 1)))
-    return node
-
-
-def _heat_map(graph: _Graph, logits: str) -> str:
-    probabilities = graph.node("Softmax", logits, axis=1)
-    pixels = graph.slice(probabilities, [1], graph.constant([0]), graph.constant([CELL * CELL]))
-    return str(graph.node("DepthToSpace", pixels, blocksize=CELL, mode="DCR"))
-
-
-def _best_pixels(graph: _Graph, heat: str, size: str, settings: NetworkSettings) -> tuple[str, str]:
+def _best_pixels(graph: OnnxGraph, heat: str, size: str, settings: NetworkSettings) -> tuple[str, str]:
     """Scores (B, N) of the best local maxima and their position row · width + column, zero where there are no more."""
     radius, border = settings.nms_radius, settings.border
     window = 2 * radius + 1
@@ -177,7 +108,7 @@ def _best_pixels(graph: _Graph, heat: str, size: str, settings: NetworkSettings)
     return best_scores, graph.node("Min", index, last)
 
 
-def _offsets(graph: _Graph, heat: str, size: str, index: str, radius: int) -> str:
+def _offsets(graph: OnnxGraph, heat: str, size: str, index: str, radius: int) -> str:
     """Centre of mass of the heat map around the pixels at `index` (B, N), as offsets (B, N, 2)."""
     steps = np.arange(-radius, radius + 1, dtype=np.float32)
     y, x = np.meshgrid(steps, steps, indexing="ij")
@@ -192,11 +123,11 @@ def _offsets(graph: _Graph, heat: str, size: str, index: str, radius: int) -> st
     return str(graph.node("Div", moments, graph.node("Max", mass, graph.number(1e-30))))
 
 
-def _unsqueezed(graph: _Graph, index: str) -> str:
+def _unsqueezed(graph: OnnxGraph, index: str) -> str:
     return str(graph.node("Unsqueeze", index, graph.constant([2])))
 
 
-def _sampling_grid(graph: _Graph, keypoints: str, padded_size: str) -> str:
+def _sampling_grid(graph: OnnxGraph, keypoints: str, padded_size: str) -> str:
     """Keypoints (B, N, 2) as a grid (B, 1, N, 2) in which -1 and 1 are the outer edges of the padded image."""
     width_height = graph.node("Gather", padded_size, graph.constant([1, 0]))
     scaled = graph.node("Add", graph.node("Mul", keypoints, graph.number(2)), graph.number(1))
@@ -204,7 +135,7 @@ def _sampling_grid(graph: _Graph, keypoints: str, padded_size: str) -> str:
     return str(graph.node("Unsqueeze", graph.node("Sub", scaled, graph.number(1)), graph.constant([1])))
 
 
-def _sample(graph: _Graph, cells: str, grid: str) -> str:
+def _sample(graph: OnnxGraph, cells: str, grid: str) -> str:
     """Bilinear values (B, N, C) of cells (B, C, Hc, Wc)."""
     values = graph.node("GridSample", cells, grid, mode="bilinear", padding_mode="border", align_corners=0)
     return str(graph.node("Transpose", graph.node("Squeeze", values, graph.constant([2])), perm=[0, 2, 1]))

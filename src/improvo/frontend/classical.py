@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from improvo.errors import ConfigError, InputError
+from improvo.errors import ConfigError, InputError, MissingExtraError, installed
 from improvo.frontend.masking import check_mask, unmasked, without_masked
 from improvo.types import Features, Float32, Int64, Mask, UInt8
 
@@ -88,6 +88,9 @@ class SurfFrontend:
     """SURF (Bay 2008), from OpenCV where the build has it, else from mahotas.
 
     OpenCV's pre-built packages leave SURF out.
+
+    Raises:
+        MissingExtraError: neither has it.
     """
 
     name = "surf"
@@ -96,6 +99,8 @@ class SurfFrontend:
         self._max_keypoints = max_keypoints
         self._threshold = 0.01 if sensitive else 0.1
         self._opencv = _opencv_surf(30.0 if sensitive else 100.0)
+        if self._opencv is None and not installed("mahotas"):
+            raise MissingExtraError("the frontend surf", "surf")
 
     def __call__(self, image: UInt8, mask: Mask | None = None) -> Features:
         """Features of one image (H, W) or (H, W, 3) BGR, uint8; where there is a mask (H, W), on its True pixels."""
@@ -176,7 +181,12 @@ def _orb(count: int, sensitive: bool) -> Any:
 
 def _akaze(count: int, sensitive: bool) -> Any:
     # OpenCV 5 moved AKAZE to the contrib module
-    create = getattr(_opencv, "AKAZE_create", None) or _opencv.xfeatures2d.AKAZE_create
+    contributed = getattr(_opencv, "xfeatures2d", None)
+    create = getattr(_opencv, "AKAZE_create", None) or getattr(contributed, "AKAZE_create", None)
+    if create is None:
+        raise ConfigError(
+            f"frontend akaze: OpenCV {cv2.__version__} has it in opencv-contrib-python(-headless) alone; install that"
+        )
     return create(threshold=1e-4 if sensitive else 1e-3)
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from improvo.errors import InputError
 from improvo.frontend.network import Image, prepare
+from improvo.frontend.runtime import cpu_runtime
 from improvo.frontend.weights import Weights
 
 
@@ -21,7 +22,10 @@ def calibrate(weights: Weights, images: Iterable[Image], quantile: float = 0.999
     Raises:
         InputError: no images, or weights that int8 cannot run.
     """
-    from improvo.frontend.runtime_openvino import activation_ranges
+    if cpu_runtime() == "openvino":
+        from improvo.frontend.runtime_openvino import activation_ranges
+    else:
+        from improvo.frontend.runtime_onnxruntime import activation_ranges
 
     if weights.architecture.normalisation == "after_relu":
         raise InputError("int8 needs activations that are not negative: not for batch norm after the ReLU")

@@ -36,10 +36,10 @@ def load_frontend(
     Raises:
         ConfigError: an unknown name, network options for a classical frontend, or `least_stability` for a frontend
             without a stability head.
+        MissingExtraError: `surf` without the package mahotas.
         InputError: a weights file that cannot be read.
     """
-    if name in CLASSICAL and network not in (None, NetworkOptions()):
-        raise ConfigError(f"frontend {name}: is not a network, so the settings `frontend.network` do not apply to it")
+    check_frontend(name, network)
     if name == "surf":
         from improvo.frontend.classical import SurfFrontend
 
@@ -49,20 +49,43 @@ def load_frontend(
 
         spread = name == "orb" and not opencv_defaults
         frontend = ClassicalFrontend(name, max_keypoints, sensitive=not opencv_defaults, spread=spread)
-    elif name in NETWORKS or Path(name).suffix == ".safetensors":
+    else:
         from improvo.frontend.network import NetworkFrontend
         from improvo.frontend.weights import find_weights, load_weights
 
         settings = NetworkSettings(max_keypoints=max_keypoints, **asdict(network or NetworkOptions()))
         frontend = NetworkFrontend(load_weights(find_weights(name)), settings, name=name)
-    else:
-        known = ", ".join((*NETWORKS, *CLASSICAL))
-        raise ConfigError(f"frontend {name!r}: unknown; choose among {known}, or give a .safetensors weights file")
     if not least_stability:
         return frontend
     from improvo.frontend.stable_only import StableOnly
 
     return StableOnly(frontend, least_stability)
+
+
+def check_frontend(name: str, network: NetworkOptions | None = None) -> None:
+    """Refuse a wrong name before any work is done; nothing is loaded. Arguments as `load_frontend`.
+
+    Raises:
+        ConfigError: an unknown name, or network options for a classical frontend.
+        InputError: a weights file that is not there.
+        MissingExtraError: `surf` without the package mahotas.
+    """
+    if name in CLASSICAL:
+        if name == "surf":
+            from improvo.frontend.classical import SurfFrontend
+
+            SurfFrontend()  # whether what it needs is installed
+        if network not in (None, NetworkOptions()):
+            raise ConfigError(
+                f"frontend {name}: is not a network, so the settings `frontend.network` do not apply to it"
+            )
+        return
+    if name not in NETWORKS and Path(name).suffix != ".safetensors":
+        known = ", ".join((*NETWORKS, *CLASSICAL))
+        raise ConfigError(f"frontend {name!r}: unknown; choose among {known}, or give a .safetensors weights file")
+    from improvo.frontend.weights import find_weights
+
+    find_weights(name)
 
 
 def frontend_from(settings: FrontendSettings) -> Frontend:

@@ -1,10 +1,10 @@
-"""What runs a network: one interface over OpenVINO (the default, without torch) and torch."""
+"""What runs a network: one interface over OpenVINO (the default, without torch), ONNX Runtime and torch."""
 
 from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-from improvo.errors import ConfigError
+from improvo.errors import ConfigError, MissingExtraError, installed
 from improvo.frontend.channel_pruning import without_dead_channels
 from improvo.frontend.settings import NetworkSettings
 from improvo.frontend.weights import Weights
@@ -29,6 +29,11 @@ class Runtime(Protocol):
         ...
 
 
+def cpu_runtime() -> str:
+    """`openvino`, or `onnxruntime` where only that is installed."""
+    return "onnxruntime" if installed("onnxruntime") and not installed("openvino") else "openvino"
+
+
 def open_runtime(weights: Weights, settings: NetworkSettings) -> Runtime:
     """The runtime that the settings ask for.
 
@@ -37,23 +42,30 @@ def open_runtime(weights: Weights, settings: NetworkSettings) -> Runtime:
         MissingExtraError: the runtime's library is not installed.
     """
     weights = without_dead_channels(weights)
-    name = settings.runtime
+    name: str = settings.runtime
     if name == "auto":
-        name = "torch" if settings.device == "cuda" or settings.precision == "float16" else "openvino"
+        name = "torch" if settings.device == "cuda" or settings.precision == "float16" else cpu_runtime()
     if name == "torch":
         from improvo.frontend.runtime_torch import TorchRuntime
 
         if settings.precision == "int8":
-            raise ConfigError("setting `precision`: int8 runs in runtime=openvino, not in torch")
+            raise ConfigError("setting `precision`: int8 runs in runtime=openvino or onnxruntime, not in torch")
         half = settings.precision == "float16" or (settings.precision == "auto" and settings.device == "cuda")
         return TorchRuntime(weights, device=settings.device, half=half, threads=settings.threads)
-    from improvo.frontend.runtime_openvino import OpenVinoRuntime
-
     if settings.precision == "float16":
-        raise ConfigError("setting `precision`: float16 runs in runtime=torch, not in openvino")
+        raise ConfigError(f"setting `precision`: float16 runs in runtime=torch, not in {name}")
     calibrated = bool(weights.card.activation_ranges)
     if settings.precision == "int8" and not calibrated:
         raise ConfigError(
             "setting `precision`: int8 needs weights with activation ranges; `improvo weights calibrate` adds them"
         )
-    return OpenVinoRuntime(weights, int8=calibrated and settings.precision != "float32", threads=settings.threads)
+    int8 = calibrated and settings.precision != "float32"
+    if name == "onnxruntime":
+        from improvo.frontend.runtime_onnxruntime import OnnxRuntime
+
+        return OnnxRuntime(weights, int8=int8, threads=settings.threads)
+    if not installed("openvino"):
+        raise MissingExtraError("running a network without OpenVINO", "onnxruntime")
+    from improvo.frontend.runtime_openvino import OpenVinoRuntime
+
+    return OpenVinoRuntime(weights, int8=int8, threads=settings.threads)

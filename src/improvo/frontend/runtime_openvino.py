@@ -8,6 +8,15 @@ from typing import Any
 import numpy as np
 
 from improvo.frontend.architecture import CELL, POOL_AFTER
+from improvo.frontend.int8 import (
+    ACTIVATION_MAX,
+    IMAGE_COPIES,
+    LAST_LAYERS,
+    WEIGHT_MAX,
+    in_eight_bits,
+    largest_of_channels,
+    spread_over_copies,
+)
 from improvo.frontend.openvino_library import openvino as ov
 from improvo.frontend.openvino_library import opset13 as ops
 from improvo.frontend.runtime import NetworkMaps
@@ -15,9 +24,6 @@ from improvo.frontend.weights import Weights
 from improvo.types import Float32
 
 _KEPT_SIZES = 4
-INT8_MAX = 127
-INT8_IMAGE_COPIES = 4
-INT8_LAST_LAYERS = ("descriptor.1",)  # of the 1×1 convolutions; rounding the detector's moves keypoints
 
 
 class OpenVinoRuntime:
@@ -108,7 +114,7 @@ class _Graph:
         for head in self._heads:
             reader = f"{head}.1"
             read[reader] = self._convolution(f"{head}.0", node)
-            if reader in INT8_LAST_LAYERS:
+            if reader in LAST_LAYERS:
                 read[reader] = self._quantised(reader, read[reader])
             heads[head] = self._convolution(reader, read[reader])
         if taps:
@@ -121,9 +127,9 @@ class _Graph:
         layer = self._layers[name]
         weight = ops.constant(layer.weight)
         if self._ranges and name == "encoder.0":
-            node = ops.concat([node] * INT8_IMAGE_COPIES, axis=1)
-            weight = _quantised_weight(_spread(layer.weight))
-        elif self._ranges and (layer.convolution.kernel > 1 or name in INT8_LAST_LAYERS):
+            node = ops.concat([node] * IMAGE_COPIES, axis=1)
+            weight = _quantised_weight(spread_over_copies(layer.weight))
+        elif self._ranges and in_eight_bits(name, layer.convolution.kernel):
             weight = _quantised_weight(layer.weight)
         pad = layer.convolution.kernel // 2
         node = ops.convolution(node, weight, [1, 1], [pad, pad], [pad, pad], [1, 1])
@@ -139,28 +145,15 @@ class _Graph:
         if not self._ranges:
             return node
         low, high = ops.constant(np.float32(0)), ops.constant(np.float32(self._ranges[reader]))
-        return ops.fake_quantize(node, low, high, low, high, 256)  # unsigned: nothing is negative behind a ReLU
+        # unsigned: nothing is negative behind a ReLU
+        return ops.fake_quantize(node, low, high, low, high, ACTIVATION_MAX + 1)
 
 
 def _quantised_weight(weight: Float32) -> Any:
     """Signed and symmetric, with one step for each output channel."""
-    limit = np.abs(weight).max(axis=(1, 2, 3), keepdims=True)
+    limit = largest_of_channels(weight)
     low, high = ops.constant(-limit), ops.constant(limit)
-    return ops.fake_quantize(ops.constant(weight), low, high, low, high, 2 * INT8_MAX + 1)
-
-
-def _spread(weight: Float32) -> Float32:
-    """The first layer's weight (O, 1, 3, 3) as a sum over copies of the image (O, copies, 3, 3).
-
-    Eight bits are too few for the weights of the first layer. Each weight is rounded to steps four times finer, and
-    split into a sum over four copies of the image. Processors add products in groups of four, so the copies cost no
-    time.
-    """
-    limit = np.abs(weight).max(axis=(1, 2, 3), keepdims=True)
-    step = np.maximum(limit, 1e-30) / (INT8_MAX * INT8_IMAGE_COPIES)
-    whole, rest = np.divmod(np.rint(weight / step), INT8_IMAGE_COPIES)
-    parts = whole + (np.arange(INT8_IMAGE_COPIES)[:, None, None] < rest)
-    return np.asarray(parts * step, np.float32)
+    return ops.fake_quantize(ops.constant(weight), low, high, low, high, 2 * WEIGHT_MAX + 1)
 
 
 def _heat_map(logits: Any) -> Any:

@@ -9,7 +9,7 @@ from improvo.errors import ConfigError
 
 DEFAULT_FRONTEND = "superpoint-vo"
 _CHOICES = {
-    "runtime": ("auto", "openvino", "torch"),
+    "runtime": ("auto", "openvino", "onnxruntime", "torch"),
     "precision": ("auto", "float32", "int8", "float16"),
     "device": ("cpu", "cuda"),
 }
@@ -28,7 +28,8 @@ class NetworkOptions:
     border: int = 4  # pixels: no keypoints this close to the image's edge
     subpixel_radius: int = 4  # move to the centre of mass of the heat map within this radius; 0 keeps whole pixels
     corner_radius: int = 5  # then move to the best corner within this radius, or drop; 0 skips this step
-    runtime: Literal["auto", "openvino", "torch"] = "auto"  # auto: openvino on the CPU, torch where device is cuda
+    # auto: openvino on the CPU, onnxruntime where that is not installed; torch where device is cuda
+    runtime: Literal["auto", "openvino", "onnxruntime", "torch"] = "auto"
     precision: Literal["auto", "float32", "int8", "float16"] = "auto"  # auto: int8 if the weights are calibrated for it
     threads: int = 0  # 0: as many as the machine has
     device: Literal["cpu", "cuda"] = "cpu"  # cuda needs torch
@@ -44,8 +45,8 @@ class NetworkOptions:
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
                 raise ConfigError(f"setting `{name}`: choose among {', '.join(choices)}, not {getattr(self, name)!r}")
-        if self.device == "cuda" and self.runtime == "openvino":
-            raise ConfigError("setting `runtime`: openvino runs on the CPU; use runtime=torch with device=cuda")
+        if self.device == "cuda" and self.runtime in ("openvino", "onnxruntime"):
+            raise ConfigError(f"setting `runtime`: {self.runtime} runs on the CPU; use runtime=torch with device=cuda")
 
 
 @dataclass(frozen=True)

@@ -58,11 +58,17 @@ class SuperPoint(nn.Module):
         stability = None if self.stability is None else self.stability(shared)
         return NetworkOutput(self.detector(shared), self.descriptor(shared), stability)
 
-    def encode(self, image: Tensor) -> Tensor:
-        """The features that the heads share, (B, F, Hc, Wc), of `image` (B, 1, H, W)."""
+    def encode(self, image: Tensor, first: int = 0, last: int = 8) -> Tensor:
+        """The features that the heads share, (B, F, Hc, Wc), of `image` (B, 1, H, W).
+
+        Args:
+            image: or, where `first` is not 0, what the layers before `first` make of it.
+            first: layer to begin with.
+            last: layer to end before; the features are those of the layers up to it.
+        """
         shared = image
-        for position, block in enumerate(self.encoder):  # at H×W, H/2×W/2, H/4×W/4, H/8×W/8: two convolutions each
-            shared = block(shared)
+        for position in range(first, last):  # at H×W, H/2×W/2, H/4×W/4, H/8×W/8: two convolutions each
+            shared = self.encoder[position](shared)
             if position in POOL_AFTER:
                 shared = functional.max_pool2d(shared, 2)
         return shared

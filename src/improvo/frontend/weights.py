@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from improvo import config, files
 from improvo.errors import ConfigError, InputError
+from improvo.formats import FORMAT, FORMAT_KEY, check_format
 from improvo.frontend.architecture import Architecture, Convolution
 from improvo.types import Float32
 from improvo.untrusted.arrays import check_array
@@ -120,7 +121,8 @@ def save_weights(path: Path, tensors: Mapping[str, NDArray[np.generic]], card: M
 
     kept = {name: np.ascontiguousarray(values, np.float32) for name, values in tensors.items() if not _counter(name)}
     _check_tensors(path, kept, card.architecture)
-    text = json.dumps(config.to_dict(card), allow_nan=False)
+    # the format stands within the card: safetensors writes several entries of its metadata in any order
+    text = json.dumps({FORMAT_KEY: FORMAT, **config.to_dict(card)}, allow_nan=False)
     with files.written_atomically(path) as temporary:
         temporary.write_bytes(save(dict(sorted(kept.items())), metadata={HEADER_KEY: text}))
     files.write_json(path.with_suffix(".json"), config.to_dict(card))
@@ -130,7 +132,8 @@ def load_weights(path: Path) -> Weights:
     """Read a weights file; nothing is unpickled or executed.
 
     Raises:
-        InputError: missing, truncated, not safetensors, without an improvo card, or of another architecture.
+        InputError: missing, truncated, not safetensors, without an improvo card, of another architecture, or written
+            by a later improvo.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -148,7 +151,10 @@ def load_weights(path: Path) -> Weights:
     if header is None:
         raise InputError(f"{path}: safetensors without an improvo model card; convert it with `improvo weights import`")
     try:
-        card = config.from_dict(ModelCard, load_json(header), where="model card")
+        values = load_json(header)
+        if isinstance(values, dict):
+            check_format(values.pop(FORMAT_KEY, None), path, "fetch or export it again")
+        card = config.from_dict(ModelCard, values, where="model card")
     except (ValueError, ConfigError) as error:
         raise InputError(f"{path}: not readable, {error}; was it made by another version of improvo?") from None
     _check_tensors(path, tensors, card.architecture)

@@ -29,6 +29,10 @@ class Similarity:
         a_from_cam[:, :3, 3] = self.apply(b_from_cam[:, :3, 3])
         return a_from_cam
 
+    def after(self, other: Similarity) -> Similarity:
+        """Frame a from frame c, where `other` is frame b from frame c."""
+        return Similarity(self.scale * other.scale, self.rotation @ other.rotation, self.apply(other.translation))
+
 
 def align_points(target: Float64, source: Float64, with_scale: bool) -> Similarity:
     """The similarity (or rigid motion) that carries one set of points onto another, least squares.

@@ -29,14 +29,22 @@ class Estimate:
     memory_mib: float
     disk_mib: float
     steps: int
+    labeled_frames: int  # over all rounds
+    other_minutes: float  # of depth, training and validation
 
     @property
     def words(self) -> str:
         """For a person."""
+        minutes = max(self.minutes, 1)
+        time = f"{minutes:.0f} minutes" if minutes < 100 else f"{minutes / 60:.1f} hours"
         return (
-            f"about {max(self.minutes, 1):.0f} minutes on two calm cores, {self.memory_mib / 1024:.1f} GiB of memory "
-            f"and {self.disk_mib:.0f} MiB of disk; {self.steps} steps of training a round"
+            f"about {time} on two calm cores, {self.memory_mib / 1024:.1f} GiB of memory "
+            f"and {_size(self.disk_mib)} of disk; {self.steps} steps of training a round"
         )
+
+
+def _size(mib: float) -> str:
+    return f"{mib:.0f} MiB" if mib < 1000 else f"{mib / 1024:.1f} GiB"
 
 
 def estimate(
@@ -60,16 +68,12 @@ def estimate(
     each = 60 * settings.minutes if settings.minutes else steps * step
     validation = 0.12 * size * held_back * 2 + 3 * settings.validation.matches.pairs * _SECONDS_PER_PAIR
     frames = (2 if settings.recipe == HELD else 1) * (training + held_back) + (rounds - 1) * training
-    seconds = (
-        frames * _SECONDS_PER_FRAME * size
-        + deep * _SECONDS_PER_DEPTH * size
-        + trainings * each
-        + (1 + trainings) * validation
-    )
+    others = deep * _SECONDS_PER_DEPTH * size + trainings * each + (1 + trainings) * validation
+    seconds = frames * _SECONDS_PER_FRAME * size + others
     small = min(pixels, settings.held.longer_side**2 * 3 // 4)
     memory = _TORCH_MIB + min(training, reference.most_training) * (2.5 * small + 4 * pixels / 4) / _MIB
     disk = 60 + 0.1 * (training + held_back) * (1 + trainings) + deep * pixels / 4 * 1.3 / _MIB + 12 * trainings
-    return Estimate(seconds / 60, memory, disk, steps)
+    return Estimate(seconds / 60, memory, disk, steps, frames, others / 60)
 
 
 def refuse_full_disk(folder: Path, needed: Estimate) -> None:

@@ -14,6 +14,7 @@ from improvo.continuation import SettingsRecord
 from improvo.errors import ConfigError
 from improvo.files import check_output_folder, make_output_folder
 from improvo.improvement.settings import ImproveSettings
+from improvo.locations import removed
 
 COMMAND = "improve"
 # settings of the optimiser that may differ when a run is continued: none of these alters a result
@@ -77,6 +78,7 @@ class ImproveFolder:
         evaluate: as given by the user.
         settings: of the loop.
         start: weights file that it starts from.
+        after: finished folder of the loop that this one follows; may be none.
 
     Raises:
         OutputError: the folder is not ours, or cannot be written.
@@ -84,7 +86,13 @@ class ImproveFolder:
     """
 
     def __init__(
-        self, folder: Path, sequences: Sequence[Path], evaluate: Sequence[Path], settings: ImproveSettings, start: Path
+        self,
+        folder: Path,
+        sequences: Sequence[Path],
+        evaluate: Sequence[Path],
+        settings: ImproveSettings,
+        start: Path,
+        after: Path | None = None,
     ) -> None:
         check_output_folder(folder, COMMAND)
         self.folder = folder
@@ -92,6 +100,8 @@ class ImproveFolder:
         values["frontend"]["name"] = f"sha256:{hashlib.sha256(start.read_bytes()).hexdigest()}"
         values["sequences"] = [str(path.resolve()) for path in sequences]
         values["evaluate"] = [str(path.resolve()) for path in evaluate]
+        if after is not None:
+            values["after"] = str(after.resolve())
         self._begin(values)
 
     @property
@@ -150,7 +160,7 @@ class ImproveFolder:
 
     def _begin(self, values: dict[str, Any]) -> None:
         free = [f"{section}.optimiser.{name}" for section in ("training", "held") for name in _FREE]
-        free.append("control")  # it may be added later
+        free += ["training.memory_mib", "control"]  # a control may be added later
         record = SettingsRecord(self.folder / "settings.yaml", ImproveSettings, free)
         if self.split.is_file():
             self._refuse_former(record)
@@ -158,6 +168,7 @@ class ImproveFolder:
         elif record.difference(values):  # nothing has come of it yet
             for folder in (self.reference, self.start.folder):
                 shutil.rmtree(folder, ignore_errors=True)
+                removed(folder)
         make_output_folder(self.folder, COMMAND)
         record.write(values)
         for leftover in list(self.folder.rglob(".*.partial*")):  # of a killed run; some lie in others

@@ -13,17 +13,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from improvo.errors import ConfigError
 from improvo.files import make_output_folder
 from improvo.folder_lock import locked
 from improvo.frontend.weights import load_weights, save_weights
+from improvo.improvement.earlier import earlier_runs
 from improvo.improvement.estimate import refuse_full_disk
 from improvo.improvement.folder import COMMAND, Candidate, ImproveFolder
+from improvo.improvement.plan import first_estimate
 from improvo.improvement.progress import ImprovementProgress
 from improvo.improvement.recipe import Train, TrainingJob
-from improvo.improvement.reference import ReferencePart
+from improvo.improvement.reference import HELD_BACK, TRAINING, ReferencePart
 from improvo.improvement.report import write_report
 from improvo.improvement.rounds import Rounds, starting_weights
-from improvo.improvement.settings import ImproveSettings
+from improvo.improvement.settings import DEFAULT_START, ImproveSettings
 from improvo.improvement.split import Split
 from improvo.improvement.validation import Validation, is_better, rule, summary
 
@@ -53,6 +56,7 @@ def improve(
     data: tuple[DataSource, ...] = (),
     progress: ImprovementProgress | None = None,
     train: Train | None = None,
+    after: Path | None = None,
 ) -> Improvement:
     """Improve a frontend on recordings without ground truth.
 
@@ -67,6 +71,8 @@ def improve(
         data: what the model card says about the recordings.
         progress: is told progress and results.
         train: in place of `improvo.improvement.recipe.train`.
+        after: finished folder of this loop. Recordings that it had are replayed and must not get worse; the others are
+            new. It starts from that folder's weights, unless the settings name a frontend other than the default.
 
     Raises:
         InputError: nothing could be labelled, or weights that cannot be read.
@@ -74,18 +80,26 @@ def improve(
         OutputError: the folder is not ours, another process is at work there, or it cannot be written (full disk).
     """
     progress = progress or ImprovementProgress()
-    first_weights = starting_weights(settings.frontend.name)
+    earlier = earlier_runs(after)
+    if output.resolve() in earlier.folders:
+        raise ConfigError(f"{output}: cannot follow itself; choose another output folder")
+    sequences = earlier.without_known(sequences)
+    named = settings.frontend.name
+    first_weights = earlier.weights if earlier.weights and named == DEFAULT_START else starting_weights(named)
     make_output_folder(output, COMMAND)
     with locked(output):
-        folder = ImproveFolder(output, sequences, evaluate, settings, first_weights)
+        folder = ImproveFolder(output, sequences, evaluate, settings, first_weights, after)
         loop = Rounds(folder, settings, train or _train, data, workers, ray, progress)
+        needed = first_estimate(sequences, settings, rounds, evaluate)
+        if needed is not None:
+            progress.line(f"estimate: {needed.words}")
+            refuse_full_disk(output, needed)
         split = loop.split(sequences, evaluate, first_weights)
         progress.split(split)
         start = loop.start(first_weights, split.training)
-        needed = loop.estimate(start, split, rounds)
-        progress.line(f"estimate: {needed.words}")
-        refuse_full_disk(output, needed)
         teaching, judging = loop.reference(split)
+        teaching += earlier.parts(TRAINING)
+        judging += earlier.parts(HELD_BACK)
         result = Improvement(folder.weights, 0, (start,), (loop.validate(start, split.held_back, judging),))
         progress.validated(start, result.validations[0], result.validations[0], settings.validation)
         _keep(result, folder, split, settings)

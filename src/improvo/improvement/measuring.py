@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from improvo.improvement.reference import ReferencePart
 from improvo.improvement.settings import ValidationSettings
 from improvo.improvement.split import Part
 from improvo.improvement.validation import GapScores, Validation, write_validation
+from improvo.jobs.crew import Crew
 from improvo.jobs.pool import Workers
 from improvo.labeling.labeled import LabeledSequence, read_labels
 from improvo.labeling.store import DONE, SequenceRecord
@@ -39,8 +41,9 @@ def validate(
     reference: Sequence[ReferencePart],
     records: list[SequenceRecord],
     settings: ValidationSettings,
-    tick: Callable[[], None] = lambda: None,
+    tick: Callable[[int], None] = lambda count: None,
     progress: bool = False,
+    crew: Crew = Crew(),  # noqa: B008 - it is frozen
 ) -> Validation:
     """Measure a candidate and keep the result.
 
@@ -50,26 +53,25 @@ def validate(
         reference: the same for all candidates.
         records: of those labels.
         settings: of the validation.
-        tick: called after every pair of frames.
+        tick: is told that so many more pairs of frames are done.
         progress: whether the pose protocol shows a bar.
+        crew: who measures, a recording each.
 
     Raises:
         InputError: no pair of frames has poses and depth.
     """
-    from improvo.frontend.registry import load_frontend
-
     started = time.perf_counter()
-    frontend = load_frontend(str(candidate.weights), settings.matches.max_keypoints)
-    scores = [entry for one in reference for entry in _scores(one, frontend, settings, tick)]
-    if not scores:
+    jobs = [_ScoreJob(one, candidate.weights, settings) for one in reference]
+    scores = [entry for found in crew.results(_scores_of, jobs, tick) for entry in found]
+    if all(entry.earlier for entry in scores):
         raise InputError(
             "what is held back has no pair of frames with poses and depth; hold back a longer or livelier recording "
             "with --evaluate, or more of this one with --set split.share=0.3"
         )
     labelled = read_labels(candidate.held_back) if any(record.state == DONE for record in records) else []
-    gaps = tuple(sorted({entry.gap for entry in scores}))
+    gaps = tuple(sorted({entry.gap for entry in scores if not entry.earlier}))
     validation = Validation(
-        frames=sum(len(one.frames) for one in reference),
+        frames=sum(len(one.frames) for one in reference if not one.earlier),
         tracked=sum(record.tracked for record in records),
         segments=sum(record.segments for record in records),
         labels={name: sum(getattr(record, name) for record in records) for name in ("stable", "unstable", "ignore")},
@@ -93,6 +95,28 @@ def pairs_of(run: FixedRun, settings: ValidationSettings) -> list[Int64]:
     return [pairs for pairs in chosen if len(pairs)]
 
 
+@dataclass(frozen=True)
+class _ScoreJob:
+    """A recording to measure a frontend on."""
+
+    reference: ReferencePart
+    weights: Path
+    settings: ValidationSettings
+
+
+def _scores_of(job: _ScoreJob, tick: Callable[[], None]) -> list[GapScores]:
+    frontend = _loaded(job.weights, job.settings.matches.max_keypoints, job.weights.stat().st_mtime_ns)
+    return _scores(job.reference, frontend, job.settings, tick)
+
+
+@lru_cache(maxsize=1)
+def _loaded(weights: Path, max_keypoints: int, written: int) -> Frontend:
+    """The frontend of the recording before it, too; loading takes a second."""
+    from improvo.frontend.registry import load_frontend
+
+    return load_frontend(str(weights), max_keypoints)
+
+
 def _scores(
     reference: ReferencePart, frontend: Frontend, settings: ValidationSettings, tick: Callable[[], None]
 ) -> list[GapScores]:
@@ -107,11 +131,8 @@ def _scores(
         scores = score_pairs(run, features, pairs, settings.matches, tick)
         seconds = float(np.median(times[pairs[:, 1]] - times[pairs[:, 0]]))
         values = {name: [round(float(value), 6) for value in each] for name, each in scores.values.items()}
-        found.append(
-            GapScores(
-                reference.name, level, scores.gap, round(seconds, 3), pairs.tolist(), scores.matches.tolist(), values
-            )
-        )
+        where = reference.name, level, scores.gap, round(seconds, 3)
+        found.append(GapScores(*where, pairs.tolist(), scores.matches.tolist(), values, reference.earlier))
     return found
 
 
@@ -151,8 +172,8 @@ def _truth(
         if not usable:
             continue
         protocol = PoseSettings(
-            usable, matches.pairs, matches.max_keypoints, seed=matches.seed, shuffles=matches.shuffles,
-            right_px=matches.right_px,
+            gaps=usable, pairs=matches.pairs, max_keypoints=matches.max_keypoints, seed=matches.seed,
+            shuffles=matches.shuffles, right_px=matches.right_px,
         )  # fmt: skip
         run = run_pose_protocol(
             [Recorded(str(path), part.sequence)], [frontend], protocol, candidate.folder / "features" / str(number),

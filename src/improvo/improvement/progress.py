@@ -10,7 +10,7 @@ from improvo.improvement.settings import ValidationSettings
 from improvo.improvement.split import Split
 from improvo.improvement.validation import Validation, gain, loose
 from improvo.labeling.store import DONE, SequenceRecord
-from improvo.terminal import progress
+from improvo.terminal import counted, progress
 
 Tick = Callable[..., None]  # told that so many more are done; one if it is not told how many
 
@@ -52,7 +52,7 @@ class ImprovementProgress:
             self.line(f"{what}, {record.name}: not labelled: {record.reason}")
             return
         self.line(
-            f"{what}, {record.name}: {record.tracked} of {record.frames} frames with a pose; "
+            f"{what}, {record.name}: {record.tracked} of {counted(record.frames, 'frame')} with a pose; "
             f"{record.stable} stable, {record.unstable} unstable tracks"
         )
 
@@ -87,6 +87,8 @@ class ImprovementProgress:
         )
         if validation is not start:
             text += f"; in all {gain_words(validation, start, settings)}"
+            for one in validation.earlier:
+                text += f"; {one} {gain(validation, start, name, settings.matches, earlier=one).words}"
         text += f"; {validation.tracked} of {validation.frames} frames tracked in {validation.segments} segments"
         self.line(text if better is None else f"{text}; {'better, kept' if better else 'not better, not kept'}")
 

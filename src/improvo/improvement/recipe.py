@@ -63,9 +63,12 @@ def _train_held(job: TrainingJob) -> dict[str, Any]:
     from improvo.training.pictures import Pictures, Source
 
     settings = job.settings.held
-    posed = [entry for part in job.reference for entry in part.teaching_frames(settings.longer_side)]
+    new = [entry for part in job.reference if not part.earlier for entry in part.teaching_frames(settings.longer_side)]
+    replayed = [entry for part in job.reference if part.earlier for entry in part.teaching_frames(settings.longer_side)]
+    weight = min(len(new) / len(replayed), 1.0) if replayed else 1.0  # at most every second pair is replayed
+    posed = [*new, *(replace(entry, weight=weight) for entry in replayed)]
     sources = [_source(entry, Source) for entry in posed]
-    steps = job.steps or steps_of(job.settings, sum(len(part.frames) for part in job.reference))
+    steps = job.steps or steps_of(job.settings, sum(len(part.frames) for part in job.reference if not part.earlier))
     optimiser = replace(settings.optimiser, steps=steps, seed=job.seed)
     pairs = replace(settings.pairs, two_frames=settings.pairs.two_frames and not job.control)
     has_head = load_weights(job.start).architecture.stability
@@ -89,7 +92,8 @@ def _has_labels(store: Path) -> bool:
 
 def _source(posed: PosedSequence, kind: Any) -> Any:
     """The same frames as single pictures, for homography pairs."""
-    return kind(posed.name, posed.pictures, ("",) * len(posed.pictures), float(np.sqrt(len(posed.pictures))))
+    count = len(posed.pictures)
+    return kind(posed.name, posed.pictures, ("",) * count, posed.weight * float(np.sqrt(count)), masks=posed.masks)
 
 
 def _train_tracks(job: TrainingJob) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from improvo.labeling.labeled import LabeledSequence, read_labels
 from improvo.sequences import open_sequence
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE
 from improvo.training.posed import PosedSequence
-from improvo.types import Features, Float32, Float64, Int64, UInt8
+from improvo.types import Features, Float32, Float64, Int64, Mask, UInt8
 
 TRAINING, HELD_BACK = "training", "held-back"
 
@@ -41,6 +41,7 @@ class ReferencePart:
     labeled: LabeledSequence  # the reference run over the whole recording
     frames: Int64  # (N,) frame_index of the part's frames in it
     depth_file: Path
+    earlier: bool = False  # of a run of the loop before this one
 
     def fixed_run(self) -> FixedRun:
         """Poses and depth of the part's frames; every other frame of the run has no pose."""
@@ -79,7 +80,12 @@ class ReferencePart:
             pictures = tuple(_reduced(self.labeled.image(int(frame)), size) for frame in own)
             depths = tuple(_inverse(reader.depth(int(frame))) for frame in own)
             times = self.labeled.frames.time[own]
-            found.append(PosedSequence(self.name, pictures, times, K, run.world_from_cam[own], depths))
+            masks = [self.labeled.mask(int(frame)) for frame in own]
+            used = tuple(_reduced_mask(mask, size) for mask in masks if mask is not None)
+            masks_of_all = used if len(used) == len(own) else ()
+            found.append(
+                PosedSequence(self.name, pictures, times, K, run.world_from_cam[own], depths, masks=masks_of_all)
+            )
         return found
 
 
@@ -100,6 +106,20 @@ def reference_parts(store: Path, part: Part, kind: str) -> list[ReferencePart]:
         frames = np.flatnonzero(np.isin(labeled.frames.source_index, indices))
         found.append(ReferencePart(labeled.name, labeled, frames, labeled.folder / f"depth-{kind}.zip"))
     return found
+
+
+@dataclass(frozen=True)
+class DepthJob:
+    """What `make_depth` does in a worker."""
+
+    part: ReferencePart
+    most: int
+    settings: ReferenceSettings
+
+
+def do_depth_job(job: DepthJob, tick: Callable[[], None]) -> None:
+    """Depth maps of a part."""
+    make_depth(job.part, job.most, job.settings, tick)
 
 
 def make_depth(
@@ -183,6 +203,11 @@ def _reduced(image: UInt8, size: tuple[int, int]) -> UInt8:
     if (image.shape[1], image.shape[0]) == size:
         return image
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _reduced_mask(mask: Mask, size: tuple[int, int]) -> Mask:
+    """Used is what only used pixels have a part in."""
+    return np.asarray(cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA) == 255)
 
 
 def _inverse(depth: Float32) -> Float32:

@@ -238,7 +238,7 @@ def _draw_matches(
     frontend = load_frontend(str(candidate.weights), settings.validation.matches.max_keypoints)
     frontend.name = candidate.name
     sequence = open_sequence(part.paths[0], part.sequence)
-    gap = min(validation.scores[0].gap, len(sequence) - 1)
+    gap = min(validation.own[0].gap, len(sequence) - 1)
     a = (len(sequence) - gap) // 2
     first, second = sequence[a], sequence[a + gap]
     masks = first.mask, second.mask

@@ -12,7 +12,8 @@ from improvo.odometry.run_settings import RunSettings
 from improvo.odometry.settings import OdometrySettings
 from improvo.sequences.base import SequenceSettings
 from improvo.stability.settings import LabelSettings
-from improvo.training.settings import DevicePairSettings, HeldSettings, OdometryTrainingSettings, OptimiserSettings
+from improvo.training.held_settings import DevicePairSettings, HeldSettings
+from improvo.training.settings import OdometryTrainingSettings, OptimiserSettings
 
 DEFAULT_START = "superpoint-small"  # on a CPU a step takes a quarter of the time of one of `superpoint`
 HELD, TRACKS = "held", "tracks"

@@ -13,6 +13,7 @@ from improvo.errors import ConfigError, InputError
 from improvo.files import MARKER, write_json
 from improvo.labeling.store import DONE, RECORD_FILE, SETTINGS_FILE, SequenceRecord, sequence_names
 from improvo.sequences import SequenceSettings, open_sequence
+from improvo.terminal import counted
 from improvo.untrusted.text import read_json_file
 
 _MIN_FRAMES = 3  # of each part
@@ -70,7 +71,9 @@ def split_last_part(path: Path, sequence: SequenceSettings, share: float) -> Spl
         raise InputError(f"{path}: is a live stream; record it first")
     cut = len(opened) - max(round(len(opened) * share), _MIN_FRAMES)
     if cut < _MIN_FRAMES:
-        raise InputError(f"{path}: has {len(opened)} frames, too few to train on some and validate on the others")
+        raise InputError(
+            f"{path}: has {counted(len(opened), 'frame')}, too few to train on some and validate on the others"
+        )
     first_held, last = int(opened.indices[cut]), int(opened.indices[-1])
     training = replace(sequence, end=first_held, max_frames=None)
     held_back = replace(sequence, start=first_held, end=last + 1, max_frames=None)
@@ -103,19 +106,28 @@ def split_whole_sequences(records: Sequence[SequenceRecord], sequence: SequenceS
 def remembered_split(path: Path, choose: Callable[[], Split]) -> Split:
     """The split that `path` remembers from an earlier run, else the one that `choose` makes."""
     if path.is_file():
-        mend = "remove the folder and begin again"
-        try:
-            split = config.from_dict(Split, read_json_file(path, mend), where=str(path))
-        except ConfigError as error:
-            raise InputError(f"{error}: is damaged; {mend}") from None
-        if not split.training.paths or not split.held_back.paths:
-            raise InputError(f"{path}: is damaged; {mend}")
-        return split
+        return read_split(path)
     split = choose()
     values = config.to_dict(split)
     for part in ("training", "held_back"):
         values[part]["paths"] = [str(name) for name in values[part]["paths"]]
     write_json(path, values)
+    return split
+
+
+def read_split(path: Path) -> Split:
+    """The split of an earlier run.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    mend = "remove the folder and begin again"
+    try:
+        split = config.from_dict(Split, read_json_file(path, mend), where=str(path))
+    except ConfigError as error:
+        raise InputError(f"{error}: is damaged; {mend}") from None
+    if not split.training.paths or not split.held_back.paths:
+        raise InputError(f"{path}: is damaged; {mend}")
     return split
 
 

@@ -12,6 +12,7 @@ from improvo import config
 from improvo.errors import ConfigError, InputError
 from improvo.evaluation.pose.self_truth import PairScores, SelfTruthSettings, compare_gaps
 from improvo.files import write_json
+from improvo.formats import FORMAT, FORMAT_KEY, check_format
 from improvo.improvement.settings import ValidationSettings
 from improvo.untrusted.text import read_json_file
 
@@ -27,6 +28,7 @@ class GapScores:
     pairs: list[list[int]]  # frames of the reference run
     matches: list[int]  # of each pair, whose keypoint has depth
     values: dict[str, list[float]]  # of each pair, see `score_pairs`
+    earlier: bool = False  # a recording of a run of the loop before this one: it must not get worse
 
     def scores(self) -> PairScores:
         """As the judge wants them."""
@@ -51,9 +53,19 @@ class Validation:
     seconds: dict[str, float] = field(default_factory=dict)
 
     @property
+    def own(self) -> tuple[GapScores, ...]:
+        """The scores without those of recordings of earlier runs."""
+        return tuple(scores for scores in self.scores if not scores.earlier)
+
+    @property
+    def earlier(self) -> tuple[str, ...]:
+        """The recordings of earlier runs."""
+        return tuple(dict.fromkeys(scores.recording for scores in self.scores if scores.earlier))
+
+    @property
     def levels(self) -> tuple[int, ...]:
         """The gaps by their number, the nearest first."""
-        return tuple(sorted({scores.level for scores in self.scores}))
+        return tuple(sorted({scores.level for scores in self.own}))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -62,12 +74,12 @@ class Validation:
 
     def mean(self, name: str, level: int | None = None) -> float:
         """Mean of a value over the pairs of a gap, or of all gaps with the same weight."""
-        chosen = [scores for scores in self.scores if level in (None, scores.level)]
+        chosen = [scores for scores in self.own if level in (None, scores.level)]
         return float(np.mean([np.mean(scores.values[name]) for scores in chosen]))
 
     def gap_words(self, level: int) -> str:
         """The gap in frames and seconds, for a person; the range of it over the recordings."""
-        chosen = [scores for scores in self.scores if scores.level == level]
+        chosen = [scores for scores in self.own if scores.level == level]
         frames = _range([scores.gap for scores in chosen])
         return f"{frames} frames ({_range([scores.seconds for scores in chosen])} s)"
 
@@ -107,7 +119,12 @@ def strict(settings: SelfTruthSettings) -> str:
 
 
 def gain(
-    candidate: Validation, before: Validation, name: str, settings: SelfTruthSettings, level: int | None = None
+    candidate: Validation,
+    before: Validation,
+    name: str,
+    settings: SelfTruthSettings,
+    level: int | None = None,
+    earlier: str = "",
 ) -> Gain:
     """What a frontend adds to another one, with the interval over paired resamples of the pairs.
 
@@ -116,9 +133,14 @@ def gain(
         name: of the value.
         settings: of the intervals.
         level: of the gap; all gaps together, each with the same weight, where it is None.
+        earlier: a recording of an earlier run, in place of those of this one.
     """
     first, second = (
-        [_only(scores.scores(), name) for scores in validation.scores if level in (None, scores.level)]
+        [
+            _only(scores.scores(), name)
+            for scores in validation.scores
+            if level in (None, scores.level) and earlier == (scores.recording if scores.earlier else "")
+        ]
         for validation in (before, candidate)
     )
     found = compare_gaps(first, second, settings)[name]
@@ -131,7 +153,8 @@ def rule(settings: ValidationSettings) -> str:
         f"A frontend is better than the best one before it if a larger share of its matches is right within "
         f"{settings.matches.right_px[1]:g} pixels on the frames held back, at all gaps together and by more than "
         f"chance (95 % interval), and the odometry is not worse with it: it loses no more than "
-        f"{100 * settings.frames_lost:g} % of the frames that it tracked with the other, and breaks no more often."
+        f"{100 * settings.frames_lost:g} % of the frames that it tracked with the other, and breaks no more often. "
+        f"No recording of an earlier run may be worse by more than chance."
     )
 
 
@@ -145,7 +168,9 @@ def is_better(candidate: Validation, best: Validation, settings: ValidationSetti
     """
     kept = candidate.tracked >= (1 - settings.frames_lost) * best.tracked
     whole = candidate.segments <= best.segments + settings.segments_more
-    return kept and whole and gain(candidate, best, loose(settings.matches), settings.matches).low > 0
+    name = loose(settings.matches)
+    remembered = all(gain(candidate, best, name, settings.matches, None, one).high >= 0 for one in best.earlier)
+    return kept and whole and remembered and gain(candidate, best, name, settings.matches).low > 0
 
 
 def summary(validation: Validation, start: Validation, settings: ValidationSettings) -> dict[str, float]:
@@ -153,7 +178,7 @@ def summary(validation: Validation, start: Validation, settings: ValidationSetti
     values: dict[str, float] = {}
     for name in (strict(settings.matches), loose(settings.matches)):
         for level in validation.levels:
-            gap = next(scores.gap for scores in validation.scores if scores.level == level)
+            gap = next(scores.gap for scores in validation.own if scores.level == level)
             values[f"{name}_gap_{gap}"] = validation.mean(name, level)
             values[f"{name}_gap_{gap}_at_the_start"] = start.mean(name, level)
     return {name: round(value, 4) for name, value in values.items()}
@@ -161,7 +186,10 @@ def summary(validation: Validation, start: Validation, settings: ValidationSetti
 
 def write_validation(path: Path, validation: Validation) -> None:
     """Keep it for later runs, as JSON (which has no NaN)."""
-    write_json(path, {**asdict(validation), "error": None if np.isnan(validation.error) else validation.error})
+    write_json(
+        path,
+        {FORMAT_KEY: FORMAT, **asdict(validation), "error": None if np.isnan(validation.error) else validation.error},
+    )
 
 
 def read_validation(path: Path) -> Validation:
@@ -172,6 +200,7 @@ def read_validation(path: Path) -> Validation:
     """
     mend = "remove it, and it is measured again"
     values = read_json_file(path, mend)
+    check_format(values.pop(FORMAT_KEY, None), path, mend)
     error = values.get("error", 0.0)
     try:
         found = config.from_dict(Validation, {**values, "error": float("nan") if error is None else error})

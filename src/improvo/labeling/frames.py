@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.files import written_atomically
+from improvo.locations import exists, opened
 from improvo.sequences.base import UnreadableFrameError
-from improvo.stability.tables import read_table
+from improvo.stability.table_reading import read_table
 from improvo.types import Float64, Int64, Mask, UInt8
 from improvo.untrusted.text import reason
 
@@ -124,7 +125,7 @@ class PackedImages:
     """
 
     def __init__(self, folder: Path) -> None:
-        if not (folder / _shard_name(0)).is_file():
+        if not exists(folder / _shard_name(0)):
             raise InputError(f"{folder}: has no packed frames; label it with --pack")
         self._folder = folder
         self._group: tuple[int, list[bytes], list[bytes | None]] = (-1, [], [])
@@ -158,8 +159,8 @@ class PackedImages:
         number, row, path = frame // _FRAMES_PER_GROUP, frame % _FRAMES_PER_GROUP, self._folder / _shard_name(frame)
         try:
             if self._group[0] != number:
-                file = pq.ParquetFile(path)
-                table = file.read_row_group(frame % _FRAMES_PER_SHARD // _FRAMES_PER_GROUP)
+                with pq.ParquetFile(opened(path)) as file:
+                    table = file.read_row_group(frame % _FRAMES_PER_SHARD // _FRAMES_PER_GROUP)
                 masks = table["mask"].to_pylist() if "mask" in table.column_names else [None] * len(table)
                 self._group = number, table["jpeg"].to_pylist(), masks
             return self._group[1][row], self._group[2][row]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,14 +14,27 @@ import numpy as np
 
 from improvo.config import to_dict
 from improvo.errors import ImprovoError, InputError, OutputError
-from improvo.jobs.on_ray import run_on_ray
-from improvo.jobs.processes import Tick, run_here, run_in_processes
+from improvo.folder_lock import BusyError, claimed, seems_held
+from improvo.jobs.crew import Crew
+from improvo.jobs.processes import Tick
 from improvo.labeling.frames import FRAMES_FILE, FramesTable, pack_images, write_frames
 from improvo.labeling.labeler import run_and_label
-from improvo.labeling.store import DONE, FAILED, LabelStore, SequenceRecord, sequence_names
+from improvo.labeling.store import (
+    DONE,
+    FAILED,
+    LabelStore,
+    SequenceRecord,
+    finish_sequence,
+    finished_record,
+    lock_of,
+    sequence_names,
+)
+from improvo.locations import folder_here, refresh, url_of
 from improvo.odometry.run_settings import RunSettings
 
 logger = logging.getLogger(__name__)
+_POLL_SECONDS = 1.0
+_LOOK_AGAIN_SECONDS = 60.0
 
 
 @dataclass(frozen=True)
@@ -29,9 +43,20 @@ class LabelJob:
 
     name: str
     path: Path
-    folder: Path  # to write in; does not exist yet
+    store: Path
     settings: RunSettings
     pack: bool
+    url: str = ""  # of the store, where it is at a location
+
+    @property
+    def folder(self) -> Path:
+        """To write in."""
+        return self.store / f".{self.name}.partial"
+
+    @property
+    def lock(self) -> Path:
+        """Held while it is done."""
+        return lock_of(self.store, self.name)
 
 
 def label_sequences(
@@ -44,8 +69,12 @@ def label_sequences(
     ray: str | None = None,
     on_record: Callable[[SequenceRecord], None] = lambda record: None,
     on_frames: Callable[[int], None] = lambda count: None,
+    on_wait: Callable[[str, str], None] = lambda name, holder: None,
 ) -> list[SequenceRecord]:
     """Label every recording that the store does not have yet.
+
+    Several commands, on machines that share the folder, do it together: each takes what nobody works on, and then waits
+    for the rest.
 
     Args:
         paths: of the recordings.
@@ -57,6 +86,7 @@ def label_sequences(
         ray: address of a Ray cluster that does the work, see `improvo.jobs.on_ray`.
         on_record: is told each sequence as it is done, has failed, or was done before.
         on_frames: is told the number of further frames processed.
+        on_wait: is told the name of a sequence that another process labels, and which process.
 
     Returns:
         The records of the given recordings, in their order.
@@ -74,20 +104,33 @@ def label_sequences(
         if record.path != str(names[name]):
             raise InputError(f"{names[name]}: the store has another recording named {name}; rename one of them")
         on_record(record)
+    url = url_of(store.folder)
     jobs = [
-        LabelJob(name, path, store.partial(name), settings, pack) for name, path in names.items() if name not in before
+        LabelJob(name, path, store.folder, settings, pack, url) for name, path in names.items() if name not in before
     ]
 
-    def on_result(job: LabelJob, result: SequenceRecord | Exception) -> None:
-        records[job.name] = _stored(store, job, result)
-        on_record(records[job.name])
+    def run(jobs: Sequence[LabelJob]) -> list[LabelJob]:
+        """Do them; returns those that somebody else works on."""
+        elsewhere: list[LabelJob] = []
 
-    if ray is not None and jobs:
-        run_on_ray(label_sequence, jobs, on_result, on_frames, ray, workers)
-    elif len(jobs) <= 1 or (workers or 1) <= 1:
-        run_here(label_sequence, jobs, on_result, on_frames)
-    else:
-        run_in_processes(label_sequence, jobs, on_result, on_frames, min(workers or 1, len(jobs)))
+        def on_result(job: LabelJob, result: SequenceRecord | Exception) -> None:
+            if isinstance(result, BusyError):
+                elsewhere.append(job)
+                on_wait(job.name, result.holder)
+                return
+            records[job.name] = _stored(store, job, result)
+            on_record(records[job.name])
+
+        crew.do(label_sequence, jobs, on_result, on_frames, gpus)
+        return elsewhere
+
+    crew = Crew(workers, ray)
+    gpus = int(ray is not None and settings.frontend.network.device == "cuda")
+
+    while jobs:
+        jobs = run(jobs)
+        _wait_for_one(jobs)
+    refresh(store.folder)
     try:
         store.write_manifest()
     except OutputError as error:  # the labels do not need it, and the next run writes it
@@ -98,13 +141,40 @@ def label_sequences(
     return [records[name] for name in names]
 
 
+def _wait_for_one(jobs: Sequence[LabelJob]) -> None:
+    """Until one of the sequences that others work on is done or let go; not for ever, since their machine may die."""
+    ends = time.monotonic() + _LOOK_AGAIN_SECONDS
+    while jobs and time.monotonic() < ends:
+        if any(not seems_held(job.lock) for job in jobs):
+            return
+        time.sleep(_POLL_SECONDS)
+
+
 def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
-    """Label one recording into `job.folder`.
+    """Label one recording into its folder of the store, unless that is done.
 
     Raises:
         InputError: no frame got a pose, or no track is long enough to have a label.
-        KeyboardInterrupt: it was interrupted; the folder is worth nothing.
+        BusyError: another process does it.
+        KeyboardInterrupt: it was interrupted; the partial folder is worth nothing.
     """
+    job = replace(job, store=folder_here(job.store, job.url))
+    with claimed(job.lock, job.path):
+        done = finished_record(job.store, job.name)
+        if done is not None:
+            return done
+        shutil.rmtree(job.folder, ignore_errors=True)
+        try:
+            record = _labeled(job, tick)
+            finish_sequence(job.store, record)
+        except Exception:
+            shutil.rmtree(job.folder, ignore_errors=True)
+            raise
+        return record
+
+
+def _labeled(job: LabelJob, tick: Tick) -> SequenceRecord:
+    """Label one recording into its partial folder."""
     from improvo.sequences import open_sequence
 
     started = time.perf_counter()
@@ -115,7 +185,7 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
         raise KeyboardInterrupt
     if labeled.tracked == 0:
         raise InputError(f"{job.path}: no frame got a pose: {_last_reason(report)}")
-    counts = labeled.points.counts()
+    counts = report["tracks"]
     if counts["stable"] + counts["unstable"] == 0:
         raise InputError(f"{job.path}: no track has a label ({_why_none(quality.counts(), counts)})")
     frames = FramesTable(
@@ -141,7 +211,7 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
         tracked=labeled.tracked,
         trusted=int(quality.trusted.sum()),
         segments=len(report["segments"]),
-        tracks=len(labeled.points),
+        tracks=counts["tracks"],
         stable=counts["stable"],
         unstable=counts["unstable"],
         ignore=counts["ignore"],
@@ -152,13 +222,10 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
 
 
 def _stored(store: LabelStore, job: LabelJob, result: SequenceRecord | Exception) -> SequenceRecord:
-    """Put a result in its place; whatever goes wrong with it, such as a full disk, is a failure of this one."""
+    """The record of a result, which is kept if it is a failure."""
     if isinstance(result, SequenceRecord):
-        try:
-            store.finish(result)
-            return result
-        except (ImprovoError, OSError) as error:
-            result = error
+        store.refresh_manifest()
+        return result
     record = _failure(job, result)
     try:
         store.fail(record)
@@ -202,7 +269,12 @@ def _notes(report: dict[str, Any], quality: dict[str, int]) -> str:
     if len(report["segments"]) > 1:
         starts = ", ".join(str(segment["first"]) for segment in report["segments"][1:])
         notes.append(f"tracking began anew at frame {starts}")
-    reasons = {"high_error": "that fit badly", "little_parallax": "of little parallax", "contradicted": "in doubt"}
+    reasons = {
+        "high_error": "that fit badly",
+        "little_parallax": "of little parallax",
+        "contradicted": "in doubt",
+        "doubtful": "of a doubtful path",
+    }
     notes += [f"{quality[name]} {words}" for name, words in reasons.items() if quality[name]]
     return "; ".join(notes)
 

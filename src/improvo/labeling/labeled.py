@@ -16,6 +16,7 @@ from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import inverse
 from improvo.labeling.frames import FRAMES_FILE, FramesTable, PackedImages, read_frames
 from improvo.labeling.store import DONE, SETTINGS_FILE, SequenceRecord, read_records
+from improvo.locations import fetched
 from improvo.sequences.base import SequenceSettings
 from improvo.stability.settings import LabelSettings
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
@@ -61,7 +62,7 @@ class LabeledSequence:
     def camera(self) -> Camera:
         """The pinhole camera of the processed frames."""
         try:
-            return Camera(**read_json_file(self.folder / RUN_FILE, "label it again")["camera"])
+            return Camera(**read_json_file(fetched(self.folder / RUN_FILE), "label it again")["camera"])
         except (OSError, LookupError, TypeError, ValueError, InputError) as error:
             raise InputError(f"{self.folder / RUN_FILE}: cannot be read ({reason(error)}); label it again") from None
 
@@ -71,7 +72,7 @@ class LabeledSequence:
         from improvo.sequences import read_trajectory
 
         posed = self.frames.segment >= 0
-        trajectory = read_trajectory(self.folder / TRAJECTORY_FILE)
+        trajectory = read_trajectory(fetched(self.folder / TRAJECTORY_FILE))
         if len(trajectory) != posed.sum():
             raise InputError(f"{self.folder}: {TRAJECTORY_FILE} and {FRAMES_FILE} disagree; label it again")
         poses = np.full((len(posed), 4, 4), np.nan)

@@ -3,11 +3,12 @@ some.
 
 `improvo run` and `improvo label` both do it here, so that the same settings give the same `points.parquet`. The rule is
 applied to each track while the odometry runs, as soon as the track has ended (`improvo.odometry.recorder`), so that
-memory stays bounded. The gate needs the whole recording and comes at the end.
+memory stays bounded. The gate comes at the end, and reads what was written a part at a time.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -15,10 +16,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from improvo.files import write_json
-from improvo.labeling.quality import FrameQuality, assess_frames, withhold_labels
+from improvo.labeling.quality import (
+    FrameQuality,
+    TrackFacts,
+    assess_frames,
+    doubtful_tracks,
+    frame_medians,
+    withhold_labels,
+)
 from improvo.odometry.run import RunSummary, run_odometry
+from improvo.odometry.told_verdicts import doubtful_frames
 from improvo.stability.settings import LabelSettings
-from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, PointsWriter, read_points, read_tracks
+from improvo.stability.tables import (
+    POINTS_FILE,
+    TRACKS_FILE,
+    Observations,
+    PointsTable,
+    PointsWriter,
+    read_observations,
+    read_points,
+    read_points_parts,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -30,12 +48,19 @@ if TYPE_CHECKING:
     from improvo.sequences import Sequence
 
 
+_FRAMES_AT_A_TIME = 1000
+
+
 @dataclass(frozen=True)
 class LabeledRun(RunSummary):
     """A run with its labels."""
 
-    points: PointsTable  # as in points.parquet
     quality: FrameQuality
+
+    @property
+    def points(self) -> PointsTable:
+        """What is in points.parquet."""
+        return read_points(self.folder / POINTS_FILE)
 
 
 def run_and_label(
@@ -75,14 +100,29 @@ def apply_quality_gate(run: RunSummary, settings: LabelSettings) -> LabeledRun:
         run: a finished run, whose `points.parquet` has the labels of the rule.
         settings: of the labels. With `settings.quality.enabled` off the frames are assessed and no label is withheld.
     """
-    points, tracks = read_points(run.folder / POINTS_FILE), read_tracks(run.folder / TRACKS_FILE)
-    alarms = [event["frame_index"] for event in run.report["events"] if event["kind"] == "contradiction"]
-    trajectory = run.trajectory
-    quality = assess_frames(tracks, points, trajectory.valid, np.array(alarms, np.int64), settings, trajectory.segment)
+    points_file, tracks_file, frames = run.folder / POINTS_FILE, run.folder / TRACKS_FILE, len(run.trajectory)
+    facts = TrackFacts.of(read_points_parts(points_file), settings)
+    error, parallax = np.full((2, frames), np.nan)
+    for first in range(0, frames, _FRAMES_AT_A_TIME):
+        some = range(first, min(first + _FRAMES_AT_A_TIME, frames))
+        observations = Observations.joined(read_observations(tracks_file, some))
+        error[some.start : some.stop], parallax[some.start : some.stop] = frame_medians(observations, facts, some)
+    events = run.report["events"]
+    alarms = np.array([event["frame_index"] for event in events if event["kind"] == "contradiction"], np.int64)
+    segment = run.trajectory.segment
+    in_doubt = doubtful_frames(run.report, segment)
+    quality = assess_frames(error, parallax, run.trajectory.valid, alarms, settings, segment, in_doubt)
+    counts: Counter[str] = Counter()
     if settings.quality.enabled:
-        points = withhold_labels(points, tracks, quality.trusted, settings)
-    with PointsWriter(run.folder / POINTS_FILE) as writer:
-        writer.write(points)
-    report = {**run.report, "tracks": {**run.report["tracks"], **points.counts()}, "quality": quality.counts()}
+        doubtful = doubtful_tracks(read_observations(tracks_file), facts, quality.trusted, settings)
+        with PointsWriter(points_file) as writer:
+            for part in read_points_parts(points_file):
+                kept = withhold_labels(part, doubtful[facts.rows(part.track)])
+                counts.update(kept.counts())
+                writer.write(kept)
+    else:
+        for part in read_points_parts(points_file):
+            counts.update(part.counts())
+    report = {**run.report, "tracks": {**run.report["tracks"], **counts}, "quality": quality.counts()}
     write_json(run.folder / "run.json", report)
-    return LabeledRun(run.folder, trajectory, report, points, quality)
+    return LabeledRun(run.folder, run.trajectory, report, quality)

@@ -8,28 +8,44 @@
             frames.parquet      frame, index in the recording, time, segment, trusted
             images-00000.parquet ...   with --pack: the frames themselves
             label.json          this sequence's row of the manifest
+            landmarks-*.safetensors   made by training from the tables, see `improvo.training.landmark_files`
 
-A sequence in work lives in `.NAME.partial`; what a killed run leaves there is cleared away by the next one. The
-manifest is made from the folders, so it can be lost without harm.
+A sequence in work lives in `.NAME.partial`, and whoever works on it holds `.NAME.lock`, so that several commands can
+fill one store. What a killed run leaves there is cleared away by the next one. The manifest is made from the folders,
+so it can be lost without harm.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import shutil
-from contextlib import suppress
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from improvo.continuation import SettingsRecord
 from improvo.errors import InputError, OutputError
-from improvo.files import check_output_folder, make_output_folder, write_json, written_atomically
+from improvo.files import (
+    check_folder_format,
+    check_output_folder,
+    is_being_written,
+    make_output_folder,
+    write_json,
+    written_atomically,
+)
+from improvo.folder_lock import LOCK, BusyError, holder_of, locked, seems_held
+from improvo.locations import publish, removed
 from improvo.untrusted.text import read_json_file
 
 MANIFEST_FILE, SETTINGS_FILE, RECORD_FILE = "manifest.parquet", "settings.yaml", "label.json"
 DONE, FAILED = "done", "failed"
 _COMMAND = "label"
+_OTHER_SETTINGS = "use another folder, or --relabel"
+_BEGIN_SECONDS = 10.0
+_MANIFEST_SHARE = 20.0  # the manifest takes at most about so many times less than all else
 
 
 @dataclass(frozen=True)
@@ -78,26 +94,46 @@ class LabelStore:
     ) -> None:
         check_output_folder(folder, _COMMAND)
         self.folder = folder
+        self._refreshed, self._refresh_seconds = 0.0, 0.0
         made_with = SettingsRecord(folder / SETTINGS_FILE, kind)
         if not relabel:
-            made_with.check(settings, "use another folder, or --relabel")
-        elif made_with.difference(settings):
-            self._discard()
-        make_output_folder(folder, _COMMAND)
-        for leftover in folder.glob(".*.partial*"):
+            made_with.check(settings, _OTHER_SETTINGS)
+        if not made_with.path.is_file():
+            make_output_folder(folder, _COMMAND)
+        with _alone(folder):
+            if not relabel:
+                made_with.check(settings, _OTHER_SETTINGS)  # what another command has recorded meanwhile
+            elif made_with.difference(settings):
+                self._discard()
+            make_output_folder(folder, _COMMAND)
+            self._clear_partials()
+            made_with.write(settings)
+
+    def _clear_partials(self) -> None:
+        """Remove what nobody works on any more."""
+        for leftover in self.folder.glob(".*.partial*"):
             if leftover.is_dir() and not leftover.is_symlink():
-                shutil.rmtree(leftover, ignore_errors=True)
-            else:
+                if not seems_held(lock_of(self.folder, leftover.name[1:].removesuffix(".partial"))):
+                    shutil.rmtree(leftover, ignore_errors=True)
+            elif not is_being_written(leftover):
                 leftover.unlink(missing_ok=True)
-        made_with.write(settings)
 
     def _discard(self) -> None:
-        """Clear the folder of all sequences; one is gone, or there as a whole."""
+        """Clear the folder of all sequences; one is gone, or there as a whole.
+
+        Raises:
+            BusyError: another command labels here.
+        """
+        for lock in self.folder.glob(".*.lock"):
+            if lock.name != LOCK and seems_held(lock):
+                raise BusyError(self.folder, holder_of(lock) or "another process")
         for record in self.records():
             if record.state == DONE:
                 (self.folder / record.name).rename(self.partial(record.name))
+                removed(self.folder / record.name)
             else:
-                self._failure(record.name).unlink(missing_ok=True)
+                _failure_of(self.folder, record.name).unlink(missing_ok=True)
+                removed(_failure_of(self.folder, record.name))
 
     def records(self) -> list[SequenceRecord]:
         """All sequences that are done or have failed, by name."""
@@ -111,20 +147,15 @@ class LabelStore:
 
     def finish(self, record: SequenceRecord) -> None:
         """The sequence in its partial folder is complete: show it."""
-        partial, final = self.folder / f".{record.name}.partial", self.folder / record.name
-        write_json(partial / RECORD_FILE, asdict(record))
-        try:
-            partial.rename(final)
-        except OSError as error:
-            raise OutputError(f"{final}: cannot be put in place ({error.strerror}); remove what is there") from None
-        self._failure(record.name).unlink(missing_ok=True)
-        self._refresh_manifest()
+        finish_sequence(self.folder, record)
+        self.refresh_manifest()
 
     def fail(self, record: SequenceRecord) -> None:
         """The sequence cannot be labelled: keep the reason, drop the rest. The next run tries again."""
-        shutil.rmtree(self.folder / f".{record.name}.partial", ignore_errors=True)
-        write_json(self._failure(record.name), asdict(record))
-        self._refresh_manifest()
+        if not seems_held(lock_of(self.folder, record.name)):  # else somebody else tries already
+            shutil.rmtree(self.folder / f".{record.name}.partial", ignore_errors=True)
+        write_json(_failure_of(self.folder, record.name), asdict(record))
+        self.refresh_manifest()
 
     def write_manifest(self) -> None:
         """`manifest.parquet` from what is there."""
@@ -137,13 +168,68 @@ class LabelStore:
         with written_atomically(self.folder / MANIFEST_FILE) as temporary:
             pq.write_table(table, temporary)
 
-    def _refresh_manifest(self) -> None:
-        """On the way: the folders are what counts, so a full disk is no failure of this sequence."""
+    def refresh_manifest(self) -> None:
+        """On the way: the folders are what counts, so a full disk is no failure of a sequence.
+
+        Of many sequences it takes long, and is done less often.
+        """
+        before = time.monotonic()
+        if before - self._refreshed < _MANIFEST_SHARE * self._refresh_seconds:
+            return
         with suppress(OutputError):
             self.write_manifest()
+        self._refreshed = time.monotonic()
+        self._refresh_seconds = self._refreshed - before
 
-    def _failure(self, name: str) -> Path:
-        return self.folder / f".{name}.failed.json"
+
+def lock_of(folder: Path, name: str) -> Path:
+    """What is held by whoever labels a sequence of a store, see `improvo.folder_lock`."""
+    return folder / f".{name}.lock"
+
+
+def finished_record(folder: Path, name: str) -> SequenceRecord | None:
+    """Of a sequence of a store that is done."""
+    file = folder / name / RECORD_FILE
+    return _read_record(file) if file.is_file() else None
+
+
+def finish_sequence(folder: Path, record: SequenceRecord) -> None:
+    """The sequence in its partial folder is complete: it is now one of the store in `folder`.
+
+    Raises:
+        OutputError: it cannot be put in place.
+    """
+    partial, final = folder / f".{record.name}.partial", folder / record.name
+    write_json(partial / RECORD_FILE, asdict(record))
+    try:
+        partial.rename(final)
+    except OSError as error:
+        raise OutputError(f"{final}: cannot be put in place ({error.strerror}); remove what is there") from None
+    failure = _failure_of(folder, record.name)
+    if failure.is_file():
+        failure.unlink()
+        removed(failure)
+    publish(final)
+
+
+def _failure_of(folder: Path, name: str) -> Path:
+    return folder / f".{name}.failed.json"
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Nobody else begins or clears the store within the block, which is short: another command is waited for."""
+    ends = time.monotonic() + _BEGIN_SECONDS
+    with ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(locked(folder))
+                break
+            except BusyError:
+                if time.monotonic() > ends:
+                    raise
+                time.sleep(0.1)
+        yield
 
 
 def read_records(folder: Path) -> list[SequenceRecord]:
@@ -154,6 +240,7 @@ def read_records(folder: Path) -> list[SequenceRecord]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; `improvo label` makes it")
+    check_folder_format(folder)
     files = [*folder.glob(f"*/{RECORD_FILE}"), *folder.glob(".*.failed.json")]
     records: dict[str, SequenceRecord] = {}
     for file in files:

@@ -9,10 +9,17 @@ import numpy as np
 from improvo.backend.compile import compile_kernels, kernels_are_cached
 from improvo.compiled import all_cached
 from improvo.frontend import corners
-from improvo.odometry import projection_search
+from improvo.odometry import patch_alignment, projection_search
 from improvo.tracking import matching
 
-_OTHER_KERNELS = (matching.nearest_both_ways, projection_search.best_in_radius, corners.move_to_corners)
+_OTHER_KERNELS = (
+    matching.nearest_both_ways,
+    projection_search.best_in_radius,
+    corners.move_to_corners,
+    patch_alignment.cut_patches,
+    patch_alignment.repeated,
+    patch_alignment.align_patches,
+)
 
 
 def compile_odometry(progress: Callable[[str], None] | None = None) -> None:
@@ -27,6 +34,7 @@ def compile_odometry(progress: Callable[[str], None] | None = None) -> None:
     compile_kernels()
     _compile_matching()
     _compile_corners()
+    _compile_refinement()
 
 
 def _compile_matching() -> None:
@@ -40,3 +48,12 @@ def _compile_matching() -> None:
 def _compile_corners() -> None:
     """What moves a network's keypoints to corners: a float32 image and float32 pixels."""
     corners.refine_to_corners(np.zeros((40, 40), np.float32), np.full((1, 2), 20.0, np.float32), radius=2)
+
+
+def _compile_refinement() -> None:
+    """What aligns patches: an image of bytes and float64 pixels."""
+    image, pixels = np.zeros((40, 40), np.uint8), np.full((1, 2), 20.0)
+    patches = patch_alignment.cut_patches(image, pixels)
+    patch_alignment.repeated(patches)
+    middles = patch_alignment.patch_middles(pixels)
+    patch_alignment.align(image, pixels, patches, middles, np.eye(2)[None], max_move=1.0)

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from improvo.odometry.bridging import Join
+from improvo.odometry.segments import Segment
+from improvo.odometry.verdict import DOUBTFUL
+
+_WORTH_SAYING = 0.03  # share of the keypoints
+_SAID_AGAIN = 20  # frames
+
 
 @dataclass(frozen=True)
 class Event:
     """Something the user should know about a frame."""
 
     frame_index: int
-    kind: str  # "initialising", "segment", "lost" or "contradiction"
+    # "initialising", "segment", "lost", "contradiction", "bridged", "uncertain", "doubtful", "attached", "two motions"
+    # or "focal length"
+    kind: str
     detail: str
 
 
@@ -20,11 +29,13 @@ class EventLog:
     def __init__(self) -> None:
         self.events: list[Event] = []
         self._last_failure = ""
+        self._attached_said = 0.0
+        self._two_motions_said = -_SAID_AGAIN - 1
 
     def segment_started(self, frame_index: int, number: int) -> None:
         """A map has started; the first segment is not worth an event."""
         if number > 0:
-            self._add(frame_index, "segment", f"segment {number + 1} starts: own scale, placed by guess")
+            self._add(frame_index, "segment", f"segment {number} starts: own scale, placed by guess")
         self._last_failure = ""
 
     def initialisation_failed(self, frame_index: int, reason: str) -> None:
@@ -37,9 +48,41 @@ class EventLog:
         """A frame has no pose, because only `inliers` map points were found in it."""
         self._add(frame_index, "lost", f"only {inliers} points of the map found")
 
-    def contradicted(self, frame_index: int, consequence: str) -> None:
-        """Fresh two-view geometry says that the map is wrong."""
-        self._add(frame_index, "contradiction", f"two-view geometry contradicts the map; {consequence}")
+    def contradicted(self, frame_index: int, consequence: str, by: str = "two-view geometry") -> None:
+        """Something says that the map is wrong."""
+        self._add(frame_index, "contradiction", f"{by} contradicts the map; {consequence}")
+
+    def focal_length(self, frame_index: int, factor: float, consequence: str) -> None:
+        """The lens is not what the camera says."""
+        said = f"the focal length is about {factor:.2f} times that of the camera as given"
+        self._add(frame_index, "focal length", f"{said}; {consequence}")
+
+    def two_motions(self, frame_index: int) -> None:
+        """Two motions are in the picture, and one of them is not the camera's; said once in a while."""
+        if frame_index - self._two_motions_said > _SAID_AGAIN:
+            self._add(frame_index, "two motions", "another motion beside the map's; one of both is not the camera's")
+            self._two_motions_said = frame_index
+
+    def attached(self, frame_index: int, share: float) -> None:
+        """A share of the keypoints moves with the camera; said again only where it is much larger than before."""
+        if share > max(_WORTH_SAYING, 1.5 * self._attached_said):
+            self._attached_said = share
+            said = f"{share:.0%} of the keypoints stand in the picture while the rest moves; they make no map"
+            self._add(frame_index, "attached", said)
+
+    def bridged(self, frame_index: int, join: Join) -> None:
+        """The running map lies in the world of a segment that ended before."""
+        scale = f"scale ±{100 * join.scale_error:.1g} %"
+        self._add(
+            frame_index, "bridged", f"joined with segment {join.number}: {join.points} of its points found, {scale}"
+        )
+
+    def judged(self, segment: Segment) -> None:
+        """A segment has ended; only what a user should know of its verdict is an event."""
+        for first, last in segment.verdict.uncertain:
+            self._add(first, "uncertain", f"the scale is not determined between frames {first} and {last}")
+        if segment.verdict.word == DOUBTFUL:
+            self._add(segment.last, "doubtful", f"segment {segment.number}: {segment.verdict.evidence[0]}")
 
     def _add(self, frame_index: int, kind: str, detail: str) -> None:
         self.events.append(Event(frame_index, kind, detail))

@@ -15,9 +15,11 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.geometry.two_view import Ransac, relative_pose, sampson_errors
+from improvo.geometry.epipolar import sampson_errors
+from improvo.geometry.ransac import Ransac, relative_pose
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.view import View, ransac_pairs
+from improvo.odometry.two_motions import holds_beside
+from improvo.odometry.view import View, matches_of_world, ransac_pairs
 from improvo.tracking.matching import match_units
 from improvo.types import Int64
 
@@ -31,6 +33,7 @@ class Agreement:
     map_inliers: int
     own_inliers: int
     matches: int
+    two_motions: bool = False  # each is supported by matches that are far off the other; the check decides nothing
 
 
 class HealthCheck:
@@ -50,6 +53,7 @@ class HealthCheck:
         self._settings = settings
         self._descriptor_distance = descriptor_distance
         self._rounds: deque[Int64] = deque(maxlen=settings.health.rounds)  # of (gaps, 2) map and own inliers
+        self._two_motions = 0  # checks in a row that saw two
 
     def contradicts(self, view: View, earlier: Mapping[int, View]) -> bool:
         """Whether the last checks together say that the map is wrong.
@@ -62,20 +66,29 @@ class HealthCheck:
         if view.frame_index % settings.interval:
             return False
         counts = np.zeros((len(settings.gaps), 2), np.int64)
+        two_motions = False
         for row, gap in enumerate(settings.gaps):
             if view.frame_index - gap not in earlier:
                 continue
             found = agreement(
                 earlier[view.frame_index - gap], view, self._camera, self._descriptor_distance, self._settings
             )
-            if found.own_inliers >= max(settings.min_inliers, settings.min_inlier_share * found.matches):
+            two_motions |= found.two_motions
+            enough = found.own_inliers >= max(settings.min_inliers, settings.min_inlier_share * found.matches)
+            if enough and not found.two_motions:
                 counts[row] = found.map_inliers, found.own_inliers
         self._rounds.append(counts)
+        self._two_motions = self._two_motions + 1 if two_motions else 0
         if len(self._rounds) < settings.rounds:
             return False
         map_inliers, own_inliers = np.sum(self._rounds, axis=(0, 1))
-        enough = own_inliers >= settings.min_evidence
-        return bool(enough and map_inliers < settings.min_agreement * own_inliers)
+        decides = own_inliers >= settings.min_evidence
+        return bool(decides and map_inliers < settings.min_agreement * own_inliers)
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether the last checks saw another motion beside the map's, so that one of both is not the camera's."""
+        return self._two_motions >= self._settings.health.rounds - 1
 
 
 def agreement(a: View, b: View, camera: Camera, descriptor_distance: float, settings: OdometrySettings) -> Agreement:
@@ -94,6 +107,7 @@ def agreement(a: View, b: View, camera: Camera, descriptor_distance: float, sett
     assert a.cam_from_world is not None
     assert b.cam_from_world is not None
     matches = match_units(a.descriptors[:_FEATURES], b.descriptors[:_FEATURES], descriptor_distance)
+    matches = matches_of_world(a, b, matches)
     if len(matches) < 8:
         return Agreement(0, 0, len(matches))
     pixels_a, pixels_b = a.keypoints[matches[:, 0]], b.keypoints[matches[:, 1]]
@@ -102,8 +116,8 @@ def agreement(a: View, b: View, camera: Camera, descriptor_distance: float, sett
     ransac = Ransac(limit, settings.seed, min_iterations=100, max_iterations=1000)
     own = relative_pose(pixels_a[used], pixels_b[used], camera, ransac)
     of_map = b.cam_from_world @ se3.inverse(a.cam_from_world)
-    fits_map, fits_own = (
-        sampson_errors(b_from_a, camera, pixels_a, pixels_b) < limit for b_from_a in (of_map, own.pose)
-    )
+    map_errors, own_errors = (sampson_errors(b_from_a, camera, pixels_a, pixels_b) for b_from_a in (of_map, own.pose))
+    fits_own = own_errors < limit
     fits_own[used] = own.inliers  # which also lie in front of both
-    return Agreement(int(fits_map.sum()), int(fits_own.sum()), len(matches))
+    two_motions = holds_beside(map_errors, own_errors, pixels_b, camera, limit)
+    return Agreement(int((map_errors < limit).sum()), int(fits_own.sum()), len(matches), two_motions)

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from improvo.geometry.camera import Camera
+from improvo.geometry.epipolar import rotation_residuals
+from improvo.geometry.ransac import Ransac, RobustHomography, homography, motions_of_homography, relative_pose
 from improvo.geometry.triangulation import triangulate_tracks
-from improvo.geometry.two_view import (
-    Ransac,
-    RobustHomography,
-    homography,
-    motions_of_homography,
-    relative_pose,
-    rotation_residuals,
-)
 from improvo.odometry.settings import OdometrySettings, StartSettings
-from improvo.odometry.view import View, ransac_pairs
+from improvo.odometry.two_motions import has_second_motion
+from improvo.odometry.view import View, matches_of_world, ransac_pairs
 from improvo.tracking.matching import match_units
 from improvo.types import Float64, Int64
 
@@ -60,7 +55,7 @@ def initial_pair(
         descriptor_distance: the matching threshold on unit descriptors.
     """
     start = settings.start
-    matches = match_units(a.descriptors, b.descriptors, descriptor_distance)
+    matches = matches_of_world(a, b, match_units(a.descriptors, b.descriptors, descriptor_distance))
     rows_a, rows_b = matches[ransac_pairs(a, b, matches, settings.ransac_gate)].T
     if len(rows_a) < start.min_matches:
         return InitFailure("too few matches")
@@ -73,6 +68,9 @@ def initial_pair(
         return InitFailure("too few matches agree on a motion")
     if np.median(rotation_residuals(camera, pixels_a[inliers], pixels_b[inliers])) < start.min_rotation_residual:
         return InitFailure("too little parallax: a rotation explains the motion")
+    another = replace(ransac, max_iterations=1000)
+    if has_second_motion(essential.pose, camera, pixels_a, pixels_b, another, start.max_second_motion):
+        return InitFailure("two motions: one of them is not the camera's")
     ratio = plane.inliers.sum() / max(inliers.sum(), 1)
     off_plane = (inliers & ~plane.inliers).sum()
     if ratio > start.max_homography_ratio and off_plane < start.min_off_plane_points:

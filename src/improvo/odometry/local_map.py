@@ -9,13 +9,16 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
+from improvo.geometry.ransac import Ransac, absolute_pose
 from improvo.geometry.triangulation import triangulate_tracks
-from improvo.geometry.two_view import Ransac, absolute_pose
+from improvo.odometry.keypoint_refinement import KeypointRefiner
 from improvo.odometry.projection_search import match_by_projection
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_points, ransac_rows
 from improvo.tracking.matching import match_units
 from improvo.types import Float32, Float64, Int64
+
+_SAME_SIDE = 0.5  # cosine of the angle between two rays to a point; features are not matched over 60 degrees
 
 
 class LocalMap:
@@ -33,6 +36,7 @@ class LocalMap:
         self.history: deque[View] = deque(maxlen=settings.matching.search_frames)  # in order of processing
         self._settings = settings
         self._descriptor_distance = descriptor_distance
+        self.refiner = KeypointRefiner(camera, settings.refinement, settings.matching.search_frames)
         self._search_radius = max(3.0, settings.matching.search_radius * camera.width / 640.0)
 
     def remember(self, view: View) -> None:
@@ -54,28 +58,46 @@ class LocalMap:
         """
         inherit_points(view, neighbour)
         inliers, share = self._solve_pose(view)
-        if self._is_lost(inliers, share):
+        if self._is_lost(inliers, share) or not self._from_same_side(view, neighbour):
             for earlier in reversed(self.history):
                 self._match_with(view, earlier)
                 inliers, share = self._solve_pose(view)
-                if not self._is_lost(inliers, share):
+                if not self._is_lost(inliers, share) and self._from_same_side(view, earlier):
                     break
             else:
                 view.cam_from_world = None
                 view.points[:] = NO_POINT
                 return inliers, share
         self._search_by_projection(view)
+        self.refiner.update_poses(self.history)
+        self.refiner.refine([view], self.store)
         return inliers, share
 
     def _is_lost(self, inliers: int, share: float) -> bool:
         loss = self._settings.loss
-        return inliers < loss.min_inliers or share < loss.min_inlier_share
+        outliers = inliers / share - inliers if share > 0 else 0.0
+        return inliers < loss.min_inliers + loss.wrong_share * outliers or share < loss.min_inlier_share
+
+    def _from_same_side(self, view: View, other: View) -> bool:
+        """Whether a view sees its points from where another one, with a pose, can have seen the same of them.
+
+        A mirrored picture of a wall is the wall seen from behind: a good pose, and a wrong one.
+        """
+        assert view.cam_from_world is not None
+        assert other.cam_from_world is not None
+        xyz = self.store.xyz[view.points[view.observed]]
+        if len(xyz) == 0:
+            return False
+        rays = [xyz - se3.inverse(pose)[:3, 3] for pose in (view.cam_from_world, other.cam_from_world)]
+        cosine = (rays[0] * rays[1]).sum(axis=1) / np.maximum(np.prod(np.linalg.norm(rays, axis=2), axis=0), 1e-12)
+        return bool(np.median(cosine) > _SAME_SIDE)
 
     def _match_with(self, view: View, earlier: View) -> None:
         """3D-to-2D matches of a view by descriptors alone, against the map points of one earlier view."""
         view.points[:] = NO_POINT
         rows = earlier.observed
         matches = match_units(earlier.descriptors[rows], view.descriptors, self._descriptor_distance)
+        matches = matches[~view.attached[matches[:, 1]]]
         view.points[matches[:, 1]] = earlier.points[rows[matches[:, 0]]]
 
     def _solve_pose(self, view: View) -> tuple[int, float]:
@@ -104,7 +126,7 @@ class LocalMap:
         assert view.cam_from_world is not None
         ids, descriptors = self._points_to_search(view)
         projections, inside = self.project(view.cam_from_world, self.store.xyz[ids])
-        free = np.flatnonzero(view.points < 0)
+        free = np.flatnonzero((view.points < 0) & ~view.attached)
         pairs = match_by_projection(
             projections[inside],
             descriptors[inside],
@@ -148,9 +170,9 @@ class LocalMap:
         Returns:
             How many points were made.
         """
-        tracks = view.tracks[view.points < 0]
+        tracks = view.tracks[(view.points < 0) & ~view.attached]
         views = [view, *others]
-        seen = [(v, np.flatnonzero(np.isin(v.tracks, tracks) & (v.points < 0))) for v in views]
+        seen = [(v, np.flatnonzero(np.isin(v.tracks, tracks) & (v.points < 0) & ~v.attached)) for v in views]
         track = np.concatenate([v.tracks[rows] for v, rows in seen])
         camera = np.concatenate([np.full(len(rows), i) for i, (_, rows) in enumerate(seen)])
         row = np.concatenate([rows for _, rows in seen])
@@ -175,4 +197,7 @@ class LocalMap:
         for i, v in enumerate(views):
             of_view = (camera == i) & (point >= 0)
             v.points[row[of_view]] = point[of_view]
+        made = np.zeros(self.store.count, bool)
+        made[ids[good]] = True
+        self.refiner.refine(sorted(views, key=lambda each: each.frame_index), self.store, made)
         return int(good.sum())

@@ -8,10 +8,12 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from improvo.geometry import se3
+from improvo.geometry.alignment import Similarity
 from improvo.geometry.camera import Camera
 from improvo.odometry.map_builder import MapBuilder
-from improvo.odometry.segments import Segment, SegmentPlacement
+from improvo.odometry.segments import Segment, SegmentPlacement, extended
 from improvo.odometry.trajectory_builder import FinalView, TrajectoryBuilder
+from improvo.odometry.verdict import NOT_JUDGED, Verdict
 from improvo.odometry.view import NO_POINT, View
 from improvo.odometry.window import WindowReport
 from improvo.types import Float64, SparseMap, Trajectory
@@ -36,12 +38,14 @@ class OdometryResult:
         self._placement = SegmentPlacement()
         self._window_errors: list[float] = []  # pixels, of the running segment
         self._frame_indices: list[int] = []  # of its final views
+        self._joined: int | None = None  # the ended segment that the running one goes on
+        self._scale_error = 0.0  # relative, between the two
         self.segments: list[Segment] = []
 
     @property
     def running_segment(self) -> int:
         """Number of the segment that runs, or of the next one."""
-        return len(self.segments)
+        return len(self.segments) if self._joined is None else self._joined
 
     @property
     def trajectory(self) -> Trajectory:
@@ -55,9 +59,31 @@ class OdometryResult:
 
     def begin_segment(self) -> None:
         """A map has started. If the running segment had begun already, it is undone and begins again."""
+        self._joined = None
         if self.segments:
             self._placement.begin_next()
         self._window_errors = []
+
+    @property
+    def placement(self) -> Similarity:
+        """From the running segment's own world to the shared one."""
+        return self._placement.similarity
+
+    def join(self, number: int, shared_from_own: Similarity, scale_error: float) -> None:
+        """The running segment lies in the world of an ended one, and goes on with it under its number.
+
+        Args:
+            number: of the ended segment.
+            shared_from_own: from the running segment's own world to the shared one.
+            scale_error: standard error of its scale, relative.
+
+        Raises:
+            RuntimeError: views of the running segment are final already.
+        """
+        if self._frame_indices:
+            raise RuntimeError("a segment with final views cannot be joined with another one")
+        self._joined, self._scale_error = number, scale_error
+        self._placement.join(shared_from_own)
 
     def add_window(self, report: WindowReport) -> None:
         """A window of the running segment was adjusted."""
@@ -87,28 +113,38 @@ class OdometryResult:
         self._frame_indices.append(view.frame_index)
         self._emit(view, world_from_cam, self.running_segment)
 
-    def end_segment(self, xyz: Float64, reason: str) -> None:
+    def end_segment(self, xyz: Float64, reason: str, verdict: Verdict | None = None) -> Segment | None:
         """The running segment is over; all its views are final. One without any view leaves nothing.
 
         Args:
             xyz: (P, 3) its points.
             reason: why it ended, in a few words.
+            verdict: whether its path is believed; None where nobody judged it.
+
+        Returns:
+            The segment; None where it left nothing.
         """
         if not self._frame_indices:
-            return
+            self._joined = None
+            return None
         self._map.end_segment(xyz, self._placement.similarity, self.running_segment)
         errors = np.array(self._window_errors)
-        self.segments.append(
-            Segment(
-                number=self.running_segment,
-                first=min(self._frame_indices),
-                last=max(self._frame_indices),
-                frames=len(self._frame_indices),
-                mean_error=float(np.nanmean(errors)) if np.isfinite(errors).any() else float("nan"),
-                reason=reason,
-            )
+        segment = Segment(
+            number=self.running_segment,
+            first=min(self._frame_indices),
+            last=max(self._frame_indices),
+            frames=len(self._frame_indices),
+            mean_error=float(np.nanmean(errors)) if np.isfinite(errors).any() else float("nan"),
+            reason=reason,
+            verdict=verdict or Verdict(NOT_JUDGED),
         )
-        self._window_errors, self._frame_indices = [], []
+        if self._joined is None:
+            self.segments.append(segment)
+        else:
+            segment = extended(self.segments[self._joined], segment, self._scale_error)
+            self.segments[self._joined] = segment
+        self._window_errors, self._frame_indices, self._joined = [], [], None
+        return segment
 
     def with_running(
         self, posed: Iterable[tuple[View, Float64]], without_pose: Iterable[View], xyz: Float64 | None = None

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from improvo.geometry.camera import Camera
+from improvo.odometry.attached import AttachedDetector
+from improvo.odometry.bridging import Bridging
 from improvo.odometry.events import EventLog
+from improvo.odometry.focal_change import focal_change
+from improvo.odometry.former_map import FormerMap
 from improvo.odometry.health import HealthCheck
 from improvo.odometry.initial_pair import InitFailure
+from improvo.odometry.judging import SegmentJudge
 from improvo.odometry.local_map import LocalMap
 from improvo.odometry.mapper import Mapper
 from improvo.odometry.result import OdometryResult
@@ -13,11 +18,14 @@ from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.sliding_window import SlidingWindow
 from improvo.odometry.start import start_map
 from improvo.odometry.states import StateMachine, TrackingState
-from improvo.odometry.view import View
+from improvo.odometry.view import NO_POINT, View
 from improvo.odometry.window import WindowReport, adjust
 from improvo.types import Float64
 
+_CARRIED = 0.2  # share of the observations that turned out to move with the camera; with more the map is wrong
+_SAME_LENS = 0.05  # relative change of the focal length that is none
 _FIRST_COOLDOWN = 3  # frames after a costly failure to start; it doubles with each further one
+_LOST = "lost"  # why a segment ended
 
 
 class RobustMapper(Mapper):
@@ -37,9 +45,14 @@ class RobustMapper(Mapper):
         self._cooldown = 0  # frames to wait before the next try to start
         self._costly_failures = 0  # since the last map
         self._worlds = 0  # maps started
+        self._focal_factor = 1.0  # of the lens now, times what the camera says
+        self._carried = False  # a large part of the map has turned out to move with the camera
         self._window = SlidingWindow(settings.window, camera.width)
         self._health = HealthCheck(camera, settings, descriptor_distance)
+        self._judge = SegmentJudge(camera, settings)
+        self._bridging = Bridging(settings.bridging)
         self._provisional: list[View] = []  # all views of a provisional map with a pose, in order; none is final
+        self._attached = AttachedDetector(camera, settings, descriptor_distance)
 
     @property
     def state(self) -> TrackingState:
@@ -48,7 +61,16 @@ class RobustMapper(Mapper):
 
     def track(self, view: View) -> None:
         """One frame: localise, triangulate, adjust the window, check, slide."""
+        newly_attached = self._attached.observe(view)
         if self._map is None:
+            if newly_attached:
+                self._leave_out_attached(view, self._buffer)
+            self._initialise(view)
+            return
+        if newly_attached and self._leave_out_attached(view, [*self._map.history, *self._buffer]) > _CARRIED:
+            self._carried = True
+        if self._zoomed(self._map, view):
+            self._end_segment("the focal length changed")
             self._initialise(view)
             return
         inliers, _ = self._map.localise(view, self._window.newest)
@@ -61,9 +83,16 @@ class RobustMapper(Mapper):
         report = self._adjust_window(self._map)
         self._map.remember(view)
         self._result.add_window(report)
-        if self._health.contradicts(view, {earlier.frame_index: earlier for earlier in self._map.history}):
-            self._start_anew(view)
+        if self._carried:
+            self._start_anew(view, "what moves with the camera")
             return
+        if self._health.contradicts(view, {earlier.frame_index: earlier for earlier in self._map.history}):
+            self._start_anew(view, "two-view geometry")
+            return
+        if self._health.ambiguous:
+            self._events.two_motions(view.frame_index)
+            self._judge.alarm("two motions are in the picture, and one of them is not the camera's")
+        self._bridge(self._map, [view])
         self._confirm()
         self._slide()
 
@@ -104,12 +133,17 @@ class RobustMapper(Mapper):
         self._worlds += 1
         self._states.map_started()
         self._events.segment_started(self._buffer[0].frame_index, self._result.running_segment)
+        if self._focal_factor != 1.0:
+            self._events.focal_length(self._buffer[0].frame_index, self._focal_factor, "the segment is doubtful")
+            self._judge.alarm(f"the focal length is about {self._focal_factor:.2f} times that of the camera as given")
         self._result.begin_segment()
         self._result.give_up(each for each in self._buffer if each.cam_from_world is None)
         self._health = HealthCheck(self._camera, self._settings, self._descriptor_distance)
+        self._bridging.new_map()
         for each in self._buffer:
             if each.cam_from_world is not None:
                 self._add(each)
+        self._bridge(self._map, self._buffer)
         self._buffer = []
         self._slide()
 
@@ -144,23 +178,61 @@ class RobustMapper(Mapper):
             self._states.map_confirmed()
             self._provisional = []
 
+    def _bridge(self, local_map: LocalMap, views: list[View]) -> None:
+        """Join a provisional map with a former one that its keyframes see; nothing of it is final yet."""
+        if not self._states.is_provisional:
+            return
+        for view in views:
+            join = self._bridging.look(view, local_map.store.xyz) if view.keyframe else None
+            if join is None:
+                continue
+            self._result.join(join.number, join.shared_from_new, join.scale_error)
+            self._events.bridged(view.frame_index, join)
+            for each in self._provisional:
+                each.segment = join.number
+            return
+
     def _slide(self) -> None:
         self._window.slide()
         if self._map is not None and not self._states.is_provisional:
             for view, cam_from_world in self._window.take_final():
                 self._finalise(self._map, view, cam_from_world)
 
-    def _start_anew(self, view: View) -> None:
+    def _zoomed(self, local_map: LocalMap, view: View) -> bool:
+        """Whether the lens changed just before a view. What it is now holds for all that follows, until it changes."""
+        before, settings = self._window.newest, self._settings
+        if before.frame_index != view.frame_index - 1:
+            return False
+        change = focal_change(before, view, local_map.store.xyz, self._camera, settings.window.max_error, settings.seed)
+        if change == 1.0:
+            return False
+        self._focal_factor *= change
+        if abs(self._focal_factor - 1.0) < _SAME_LENS:
+            self._focal_factor = 1.0
+        self._events.focal_length(view.frame_index, self._focal_factor, "the segment ends")
+        return True
+
+    def _leave_out_attached(self, view: View, views: list[View]) -> float:
+        """Mark earlier views anew, and drop what they observe there; returns its share of all that they observed."""
+        self._attached.mark(views)
+        self._events.attached(view.frame_index, float(view.attached.mean()) if len(view) else 0.0)
+        observed = [each.points >= 0 for each in views]
+        dropped = sum(int((each.attached & seen).sum()) for each, seen in zip(views, observed, strict=True))
+        for each in views:
+            each.points[each.attached] = NO_POINT
+        return dropped / max(sum(int(seen.sum()) for seen in observed), 1)
+
+    def _start_anew(self, view: View, by: str) -> None:
         """The map is wrong: a provisional one starts anew over all its frames, another one over its last frames."""
         if self._states.is_provisional:
-            self._events.contradicted(view.frame_index, "the map is started anew")
+            self._events.contradicted(view.frame_index, "the map is started anew", by)
             self._buffer = self._provisional
             self._clear()
             self._states.map_ended()
         else:
-            self._events.contradicted(view.frame_index, "the segment ends")
+            self._events.contradicted(view.frame_index, "the segment ends", by)
             doubtful, self._window.recent = self._window.recent, []
-            self._end_segment("contradicted by two-view geometry")
+            self._end_segment(f"contradicted by {by}")
             self._buffer = doubtful
         for each in self._buffer:
             each.forget_pose()
@@ -174,7 +246,7 @@ class RobustMapper(Mapper):
         self._buffer.append(view)
         self._events.lost(view.frame_index, inliers)
         if len(self._buffer) > self._settings.loss.max_lost_frames:
-            self._end_segment("lost")
+            self._end_segment(_LOST)
 
     def _recover_lost_frames(self, local_map: LocalMap, view: View) -> None:
         """Frames lost just before `view` get their pose backwards from it, where they can."""
@@ -200,17 +272,41 @@ class RobustMapper(Mapper):
         assert self._map is not None
         for view, cam_from_world in self._window.remaining():
             self._finalise(self._map, view, cam_from_world)
-        self._result.end_segment(self._map.store.xyz, reason)
+        xyz = self._map.store.xyz
+        self._remember_former_map(self._map, reason)
+        segment = self._result.end_segment(xyz, reason, self._judge.verdict(xyz))
+        if segment is not None:
+            self._events.judged(segment)
         self._clear()
         self._states.map_ended()
 
+    def _remember_former_map(self, local_map: LocalMap, reason: str) -> None:
+        """What a later map may be joined with; a map that was contradicted is none."""
+        if reason != _LOST:
+            return
+        settings = self._settings
+        former = FormerMap(
+            self._result.running_segment,
+            self._result.placement,
+            sorted({*self._window.keyframes, *local_map.history}, key=lambda view: view.frame_index),
+            local_map.store.xyz,
+            self._camera,
+            self._descriptor_distance,
+            settings.window.max_error,
+            settings.seed,
+        )
+        self._bridging.remember(former)
+
     def _finalise(self, local_map: LocalMap, view: View, cam_from_world: Float64) -> None:
         view.cam_from_world = cam_from_world
+        self._judge.final(view, cam_from_world, local_map.store.xyz)
         self._result.finalise(view, cam_from_world, local_map.store.xyz)
 
     def _clear(self) -> None:
         """No map."""
         self._map = None
+        self._judge = SegmentJudge(self._camera, self._settings)
         self._window = SlidingWindow(self._settings.window, self._camera.width)
         self._provisional = []
         self._cooldown, self._costly_failures = 0, 0
+        self._carried = False

@@ -12,15 +12,18 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from improvo import __version__
 from improvo.config import to_dict
 from improvo.errors import InputError
 from improvo.files import make_output_folder, write_json
+from improvo.formats import FORMAT, FORMAT_KEY
 from improvo.frontend import Frontend
 from improvo.frontend.masking import features_of
 from improvo.frontend.registry import frontend_from
+from improvo.geometry.ransac import robust_solver
 from improvo.geometry.trajectory_files import write_trajectory
 from improvo.jobs.interrupts import interrupts_wait
 from improvo.odometry.ahead import detected_ahead
@@ -32,6 +35,7 @@ from improvo.odometry.trajectory_builder import FinalView
 from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
 from improvo.odometry.visualizer import NullVisualizer, Visualizer
 from improvo.sequences import Sequence
+from improvo.terminal import counted
 from improvo.types import Trajectory
 
 _MIN_FRAMES = 3
@@ -89,7 +93,9 @@ def run_odometry(
     frontend = frontend or frontend_from(settings.frontend)
     visualizer = visualizer or NullVisualizer()
     if sequence.length is not None and sequence.length < _MIN_FRAMES:
-        raise InputError(f"{sequence.path}: has {sequence.length} frames; odometry needs at least {_MIN_FRAMES}")
+        raise InputError(
+            f"{sequence.path}: has {counted(sequence.length, 'frame')}; odometry needs at least {_MIN_FRAMES}"
+        )
     make_output_folder(folder, command)
     seconds: defaultdict[str, float] = defaultdict(float)
     started = time.perf_counter()
@@ -134,7 +140,7 @@ def _track_all(
         for detected in detected_ahead(sequence, partial(features_of, frontend), odometry.match):
             with interrupts_wait():
                 start = time.perf_counter()
-                tracked = odometry.track_matched(detected.matched, detected.frame.time)
+                tracked = odometry.track_matched(detected.matched, detected.frame.time, detected.frame.image)
                 seconds["track and adjust"] += time.perf_counter() - start
                 seconds["read"] += detected.reading
                 seconds["detect"] += detected.detecting
@@ -165,6 +171,7 @@ def _report(
     has_pose = trajectory.valid
     camera = sequence.camera
     return {
+        FORMAT_KEY: FORMAT,
         "input": {
             "path": str(sequence.path),
             "format": sequence.format,
@@ -189,7 +196,14 @@ def _report(
             "lost_frames": np.flatnonzero(~has_pose).tolist(),
             "source_index": processed,
         },
-        "segments": [{**asdict(segment), "mean_error": _number(segment.mean_error)} for segment in odometry.segments],
+        "segments": [
+            {
+                **asdict(segment),
+                "mean_error": _number(segment.mean_error),
+                "verdict": segment.verdict.report(),
+            }
+            for segment in odometry.segments
+        ],
         "events": [asdict(event) for event in odometry.events],
         "points": len(odometry.map),
         "tracks": dict(tracks),
@@ -204,5 +218,14 @@ def _number(value: float) -> float | None:
 
 
 def _versions() -> dict[str, str]:
-    packages = ("numpy", "numba", "opencv-contrib-python-headless", "poselib")
-    return {"improvo": __version__, "python": platform.python_version(), **{name: version(name) for name in packages}}
+    """Of what the numbers of a run depend on."""
+    solver = robust_solver().name
+    packages = ("numpy", "numba", *(["poselib"] if solver == "poselib" else []))
+    versions = {name: version(name) for name in packages}
+    return {
+        "improvo": __version__,
+        "python": platform.python_version(),
+        **versions,
+        "opencv": str(cv2.__version__),
+        "robust_solver": solver,
+    }

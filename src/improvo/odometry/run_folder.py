@@ -13,10 +13,14 @@ from numpy.typing import NDArray
 
 from improvo import config
 from improvo.errors import InputError
+from improvo.files import check_folder_format
+from improvo.formats import FORMAT_KEY, check_format
 from improvo.geometry.camera import Camera
 from improvo.geometry.trajectory_files import read_trajectory
 from improvo.odometry.map_file import read_map
 from improvo.odometry.run import unit_of
+from improvo.odometry.told_verdicts import doubtful_frames, uncertain_frames
+from improvo.odometry.view import Mask
 from improvo.sequences import Sequence, SequenceSettings, open_sequence
 from improvo.stability.rule import IGNORE
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
@@ -62,8 +66,10 @@ class RunFolder:
         if not path.is_dir():
             raise InputError(f"{path}: no such folder; give the output folder of `improvo run`")
         try:
+            check_folder_format(path)
             report = _with_present_names(read_json_file(path / "run.json", "run `improvo run` again"))
             self.report: dict[str, Any] = _told_where(report, f"{path / 'run.json'}")
+            check_format(self.report.get(FORMAT_KEY), path / "run.json", "run `improvo run` again")
             self._recorded_input = check_path(Path(self.report["input"]["path"]))
             self.source_index: list[int] = self.report["frames"]["source_index"]
             _check(self.report)
@@ -114,6 +120,16 @@ class RunFolder:
                 "run again"
             )
         return frame_indices
+
+    @cached_property
+    def doubtful(self) -> Mask:
+        """(N,) whether the verdict of the segment is doubtful, for each row of `trajectory`."""
+        return doubtful_frames(self.report, self.trajectory.segment)
+
+    @cached_property
+    def uncertain(self) -> Mask:
+        """(N,) whether the scale is not determined there, for each row of `trajectory`."""
+        return uncertain_frames(self.report, self.frame_indices)
 
     @cached_property
     def map(self) -> SparseMap:

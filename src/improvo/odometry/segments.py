@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.alignment import Similarity
+from improvo.odometry.verdict import NOT_JUDGED, Verdict, joined
 from improvo.types import Float64
 
 
@@ -21,6 +22,24 @@ class Segment:
     frames: int  # with a pose
     mean_error: float  # pixels, mean over its window adjustments; NaN where no window was adjusted
     reason: str  # why it ended
+    verdict: Verdict = field(default_factory=lambda: Verdict(NOT_JUDGED))  # whether its path is believed
+
+
+def extended(segment: Segment, by: Segment, scale_error: float) -> Segment:
+    """A segment together with a later stretch `by` of the same world."""
+    frames = segment.frames + by.frames
+    errors = np.array([segment.mean_error, by.mean_error])
+    known = np.isfinite(errors)
+    weights = np.array([segment.frames, by.frames])[known]
+    return Segment(
+        number=segment.number,
+        first=min(segment.first, by.first),
+        last=max(segment.last, by.last),
+        frames=frames,
+        mean_error=float(np.average(errors[known], weights=weights)) if known.any() else float("nan"),
+        reason=by.reason,
+        verdict=joined(segment.verdict, by.verdict, scale_error),
+    )
 
 
 class SegmentPlacement:
@@ -36,8 +55,12 @@ class SegmentPlacement:
         self._last_depth = 1.0  # median depth there, in the shared world's unit
 
     def begin_next(self) -> None:
-        """Another segment begins; what is placed from now on belongs to it."""
+        """Another segment begins at a guess; what is placed from now on belongs to it."""
         self.similarity = Similarity(self._last_depth, self._last_pose[:3, :3], self._last_pose[:3, 3])
+
+    def join(self, similarity: Similarity) -> None:
+        """The segment that begins lies in the world of an ended one; nothing of it has been placed yet."""
+        self.similarity = similarity
 
     def place(self, cam_from_world: Float64, depths: Float64) -> Float64:
         """World_from_cam (4, 4) in the shared world.

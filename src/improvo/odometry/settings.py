@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from improvo.backend.settings import ObjectiveSettings, SolverSettings
 from improvo.errors import ConfigError
@@ -38,6 +39,7 @@ class StartSettings:
     max_homography_ratio: float = 0.7  # homography inliers over essential inliers; more is too little parallax, unless
     min_off_plane_points: int = 60  # so many essential inliers are no homography inliers, or
     plane_ratio: float = 0.8  # the ratio is at least this: then the scene is one plane, and its homography is used
+    max_second_motion: float = 0.5  # spread over the picture of another motion, as a share of the first one's
     min_parallax_deg: float = 1.0  # of a point, for it to count
     min_points: int = 30  # with that parallax
     min_inlier_share: float = 0.3  # essential inliers of the matches
@@ -71,6 +73,7 @@ class TrackingLossSettings:
     """When a frame, and when a segment, counts as lost."""
 
     min_inliers: int = 12
+    wrong_share: float = 0.1  # of wrong matches that agree with a wrong pose, where the scene repeats or is mirrored
     min_inlier_share: float = 0.1
     max_lost_frames: int = 10  # more frames than this without a pose end the segment
 
@@ -91,6 +94,52 @@ class HealthSettings:
 
 
 @dataclass(frozen=True)
+class VerdictSettings:
+    """When a segment's path is believed (see `improvo.odometry.evidence` and `improvo.odometry.verdict`)."""
+
+    window: int = 12  # keyframes that are adjusted together from each part of the evidence; half of them overlap
+    # What a change of scale between two windows moves the path by: % of it for a change by the factor e. Calibrated on
+    # simulated and real recordings with truth (docs/odometry.md).
+    scale_share: float = 40.0
+    max_error: float = 5.0  # % of the path; a larger estimated error makes a segment doubtful
+    max_focal_change: float = 0.12  # of the logarithm of the focal length, within a window or from one to the next
+    max_focal_error: float = 0.2  # of the logarithm of the focal length, from that of the camera as given
+    max_scale_error: float = 0.1  # of the logarithm of the scale between two windows; more is an uncertain stretch
+
+    def __post_init__(self) -> None:
+        if self.window < 4:
+            raise ConfigError(f"verdict.window={self.window}: must be at least 4 keyframes")
+        if not self.max_error > 0:
+            raise ConfigError(f"verdict.max_error={self.max_error}: must be positive, % of the path")
+
+
+@dataclass(frozen=True)
+class BridgingSettings:
+    """When a new map is joined with that of a segment that ended before (see `improvo.odometry.bridging`)."""
+
+    max_frames: int = 300  # since the former segment's last frame; 0 joins nothing
+    max_scale_error: float = 0.05  # standard error of the scale between both, relative
+
+    def __post_init__(self) -> None:
+        if self.max_frames < 0:
+            raise ConfigError(f"bridging.max_frames={self.max_frames}: must not be negative (0 joins nothing)")
+
+
+@dataclass(frozen=True)
+class AttachedSettings:
+    """What moves with the camera, such as a logo, is kept out of the map (see `improvo.odometry.attached`)."""
+
+    enabled: bool = True
+    noise: float = 1.5  # pixels (of a width of 640, or less) that a keypoint of something attached may move
+    min_flow: float = 4.0  # times the noise: median motion of what moves, before two views are compared
+    min_moving_cells: float = 0.4  # share of the picture's cells that moves; less may be a person before a still camera
+
+    def __post_init__(self) -> None:
+        if not (self.noise > 0 and self.min_flow >= 3 and 0 < self.min_moving_cells < 1):
+            raise ConfigError("attached: noise must be positive, min_flow at least 3, min_moving_cells within 0 and 1")
+
+
+@dataclass(frozen=True)
 class RansacGateSettings:
     """Which keypoints a RANSAC may sample, by their stability (docs/odometry.md, "Stability")."""
 
@@ -100,6 +149,26 @@ class RansacGateSettings:
     def __post_init__(self) -> None:
         if not 0 <= self.least_stability <= 1:
             raise ConfigError(f"ransac_gate.least_stability={self.least_stability}: is a probability between 0 and 1")
+
+
+@dataclass(frozen=True)
+class RefinementSettings:
+    """When a keypoint goes to where its map point's patch lies (see `improvo.odometry.keypoint_refinement`)."""
+
+    frontends: Literal["networks", "all", "none"] = "networks"  # classical keypoints are as exact without it
+    max_start: float = 3.0  # pixels between keypoint and projection; a search begins at the projection only within
+    max_move: float = 2.0  # pixels from the detected keypoint; one that would go farther stays
+    min_correlation: float = 0.8  # of the grey values of both patches
+    max_deviation: float = 0.3  # pixels, expected error of the new place
+    max_area_ratio: float = 2.5  # between two pictures; beyond it the patch is taken anew from the newer one
+
+    def __post_init__(self) -> None:
+        if self.frontends not in ("networks", "all", "none"):
+            raise ConfigError(f"refinement.frontends={self.frontends!r}: choose `networks`, `all` or `none`")
+        if min(self.max_start, self.max_move, self.max_deviation) <= 0:
+            raise ConfigError("refinement: max_start, max_move and max_deviation are pixels and must be positive")
+        if not self.max_area_ratio > 1:
+            raise ConfigError(f"refinement.max_area_ratio={self.max_area_ratio}: must be over 1")
 
 
 @dataclass(frozen=True)
@@ -114,6 +183,10 @@ class OdometrySettings:
     window: WindowSettings = field(default_factory=WindowSettings)
     loss: TrackingLossSettings = field(default_factory=TrackingLossSettings)
     health: HealthSettings = field(default_factory=HealthSettings)
+    refinement: RefinementSettings = field(default_factory=RefinementSettings)
+    verdict: VerdictSettings = field(default_factory=VerdictSettings)
+    bridging: BridgingSettings = field(default_factory=BridgingSettings)
+    attached: AttachedSettings = field(default_factory=AttachedSettings)
     objective: ObjectiveSettings = field(default_factory=lambda: ObjectiveSettings(depth_weight=0.0))
     solver: SolverSettings = field(default_factory=lambda: SolverSettings(max_iterations=8, relative_decrease=1e-3))
     paper_objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)  # of the mode `paper`

@@ -33,6 +33,11 @@ class SlidingWindow:
         return self.recent[-1]
 
     @property
+    def keyframes(self) -> list[View]:
+        """Older keyframes, in temporal order; their observations still count."""
+        return list(self._keyframes)
+
+    @property
     def free(self) -> list[View]:
         """Views whose poses are adjusted, in temporal order."""
         return [*self._keyframes[-self._settings.keyframes :], *self.recent]
@@ -58,7 +63,8 @@ class SlidingWindow:
         if last is not None:
             rows, rows_last = common_tracks(view, last)
             shared_points = np.isin(last.points[last.observed], view.points[view.observed])
-            moved = np.linalg.norm(view.keypoints[rows] - last.keypoints[rows_last], axis=1)
+            world = ~view.attached[rows]
+            moved = np.linalg.norm(view.keypoints[rows[world]] - last.keypoints[rows_last[world]], axis=1)
             few_shared = len(shared_points) == 0 or shared_points.mean() < settings.keyframe_shared
             far = len(moved) == 0 or np.median(moved) > settings.keyframe_motion * self._image_width
             long_ago = view.frame_index - last.frame_index >= settings.keyframe_interval
@@ -87,6 +93,8 @@ class SlidingWindow:
                 final.extend(_with_non_keyframes(keyframe))
                 keyframe.final, keyframe.non_keyframes = True, []
         del self._keyframes[: -(self._settings.keyframes + self._settings.fixed)]
+        for view, _ in final:
+            view.image = None
         return final
 
     def remaining(self) -> Iterator[tuple[View, Float64]]:

@@ -12,7 +12,7 @@ from improvo.geometry.camera import Camera
 from improvo.odometry.initial_pair import InitFailure, InitialPair, initial_pair
 from improvo.odometry.local_map import LocalMap
 from improvo.odometry.settings import OdometrySettings, WindowSettings
-from improvo.odometry.view import NO_POINT, View, common_tracks
+from improvo.odometry.view import View, common_tracks
 from improvo.odometry.window import adjust
 
 _SOLVER = SolverSettings(max_iterations=30, relative_decrease=1e-4)  # of the first pair, and of all views at the end
@@ -38,7 +38,7 @@ def start_map(
     """
     b = buffer[-1]
     least = settings.start.min_common_tracks
-    a = next((view for view in buffer[:-1] if len(common_tracks(view, b)[0]) >= least), None)
+    a = next((view for view in buffer[:-1] if _shared(view, b) >= least), None)
     if a is None:
         return InitFailure("too few tracks")
     pair = initial_pair(a, b, camera, settings, descriptor_distance)
@@ -48,11 +48,16 @@ def start_map(
     failure = _grow(buffer, a, b, pair, local_map, settings)
     if failure is not None:
         for view in buffer:
-            view.cam_from_world = None
-            view.points[:] = NO_POINT
+            view.forget_pose()
         return failure
     _normalise([view for view in buffer if view.cam_from_world is not None], local_map)
     return local_map
+
+
+def _shared(a: View, b: View) -> int:
+    """Tracks that two views share; what moves with the camera is no reason to think that they see the same place."""
+    rows_a, rows_b = common_tracks(a, b)
+    return int((~(a.attached[rows_a] | b.attached[rows_b])).sum())
 
 
 def _grow(
@@ -66,6 +71,7 @@ def _grow(
     report = adjust([b], [a], store, K, settings.objective, _SOLVER, window.max_error)
     if report.mean_error > start.max_mean_error or report.kept < 2 * start.min_points:
         return InitFailure("the first two views do not fit")
+    local_map.refiner.refine([a, b], store)
     local_map.remember(a)
     local_map.remember(b)
     done = [b]
@@ -116,3 +122,4 @@ def _normalise(views: Sequence[View], local_map: LocalMap) -> None:
         assert view.cam_from_world is not None
         view.cam_from_world = view.cam_from_world @ world_from_old
         view.cam_from_world[:3, 3] *= scale
+    local_map.refiner.update_poses(views)

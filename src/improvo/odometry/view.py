@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from improvo.odometry.settings import RansacGateSettings
-from improvo.types import Float32, Float64, Int64
+from improvo.types import Float32, Float64, Int64, UInt8
 
 NO_POINT = -1
 Mask = NDArray[np.bool_]
@@ -25,6 +25,8 @@ class View:
     weights: Float64  # (N,) w_ij
     tracks: Int64  # (N,) connect-the-dots track of each keypoint
     points: Int64  # (N,) map point of each keypoint, or NO_POINT
+    attached: Mask = field(default_factory=lambda: np.zeros(0, bool))  # (N,) moves with the camera: makes no map
+    image: UInt8 | None = None  # (H, W) grey, until the view is final; None where keypoints are not refined
     cam_from_world: Float64 | None = None  # (4, 4)
     segment: int = -1  # number of the segment that the pose belongs to; -1 without a pose
     world: int = 0  # number of the map that the pose belongs to; it changes where a segment is started anew, too
@@ -32,6 +34,12 @@ class View:
     final: bool = False
     # Of a keyframe: views that left the window and move along with it until it is final, with cam_from_keyframe.
     non_keyframes: list[tuple[View, Float64]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.detected = self.keypoints.copy()  # (N, 2) pixels, before any refinement (`keypoint_refinement.py`)
+        self.refined = np.zeros(len(self.keypoints), bool)
+        if len(self.attached) != len(self.keypoints):
+            self.attached = np.zeros(len(self.keypoints), bool)
 
     @property
     def observed(self) -> Int64:
@@ -43,6 +51,7 @@ class View:
         self.cam_from_world = None
         self.segment = -1
         self.points[:] = NO_POINT
+        self.keypoints[:], self.refined[:] = self.detected, False
         self.keyframe, self.non_keyframes = False, []
 
     def __len__(self) -> int:
@@ -81,6 +90,11 @@ class PointStore:
         return ids
 
 
+def matches_of_world(a: View, b: View, matches: Int64) -> Int64:
+    """The matches (K, 2), rows of `a` and of `b`, without those of something attached to the camera."""
+    return matches[~(a.attached[matches[:, 0]] | b.attached[matches[:, 1]])]
+
+
 def common_tracks(a: View, b: View) -> tuple[Int64, Int64]:
     """Rows of `a` and of `b` that belong to the same tracks."""
     _, rows_a, rows_b = np.intersect1d(a.tracks, b.tracks, assume_unique=True, return_indices=True)
@@ -111,7 +125,7 @@ def ransac_rows(weights: Float64, gate: RansacGateSettings) -> Mask:
 def inherit_points(view: View, neighbour: View) -> None:
     """Keypoints of `view` without a point take the point that their track has in `neighbour`."""
     rows, rows_neighbour = common_tracks(view, neighbour)
-    free = view.points[rows] < 0
+    free = (view.points[rows] < 0) & ~view.attached[rows]
     view.points[rows[free]] = neighbour.points[rows_neighbour[free]]
     _keep_first_of_each_point(view)
 

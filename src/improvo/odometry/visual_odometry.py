@@ -10,21 +10,23 @@ import numpy as np
 
 from improvo.frontend import Frontend
 from improvo.frontend.masking import features_of
+from improvo.frontend.registry import CLASSICAL
 from improvo.geometry.camera import Camera
 from improvo.odometry.checks import OneThread, check_features, check_frame, check_time
 from improvo.odometry.events import Event, EventLog
+from improvo.odometry.keypoint_refinement import prepared
 from improvo.odometry.mapper import Mapper
 from improvo.odometry.paper import PaperMapper
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.robust import RobustMapper
 from improvo.odometry.segments import Segment
-from improvo.odometry.settings import OdometrySettings
+from improvo.odometry.settings import OdometrySettings, RefinementSettings
 from improvo.odometry.states import TrackingState
 from improvo.odometry.trajectory_builder import FinalView
 from improvo.odometry.view import View
 from improvo.tracking.connect import TrackChain
 from improvo.tracking.matching import distance_threshold, match_units, unit_descriptors, without_flow_outliers
-from improvo.types import Features, Float32, Float64, Frame, Int64, SparseMap, Trajectory
+from improvo.types import Features, Float32, Float64, Frame, Int64, SparseMap, Trajectory, UInt8
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,7 @@ class VisualOdometry:
         self._camera = camera
         self._settings = settings or OdometrySettings()
         self._use_stability = use_stability
+        self._refines = self._settings.mode == "robust" and _is_refined(frontend, self._settings.refinement)
         self._result = OdometryResult(camera, on_final)
         self._events = EventLog()
         self._chain = TrackChain()
@@ -107,14 +110,17 @@ class VisualOdometry:
         with self._thread.alone():
             self._refuse_if_finished()
             check_frame(frame, self._camera)
-            return self.track_features(features_of(self._frontend, frame), frame.time)
+            return self.track_features(features_of(self._frontend, frame), frame.time, frame.image)
 
-    def track_features(self, features: Features, time: float) -> TrackedFrame:
-        """As `track`, with the features of the frame and its time in seconds at hand."""
+    def track_features(self, features: Features, time: float, image: UInt8 | None = None) -> TrackedFrame:
+        """As `track`, with the features of the frame and its time in seconds at hand.
+
+        Without the frame's image (H, W) or (H, W, 3) its keypoints are not refined (`odometry.refinement`).
+        """
         with self._thread.alone():
             self._refuse_if_finished()
             check_time(time)
-            return self.track_matched(self.match(features), time)
+            return self.track_matched(self.match(features), time, image)
 
     def match(self, features: Features) -> MatchedFeatures:
         """Match the next frame with the one before; frames in order, each once, and it may run ahead in a thread."""
@@ -132,14 +138,16 @@ class VisualOdometry:
         self._descriptor_width = features.descriptors.shape[1]
         return MatchedFeatures(features, descriptors, matches)
 
-    def track_matched(self, matched: MatchedFeatures, time: float) -> TrackedFrame:
-        """As `track`, with what `match` gave for the frame and its time in seconds at hand."""
+    def track_matched(self, matched: MatchedFeatures, time: float, image: UInt8 | None = None) -> TrackedFrame:
+        """As `track_features`, with what `match` gave for the frame at hand."""
         with self._thread.alone():
             self._refuse_if_finished()
-            return self._track(matched, time)
+            return self._track(matched, time, image)
 
-    def _track(self, matched: MatchedFeatures, time: float) -> TrackedFrame:
+    def _track(self, matched: MatchedFeatures, time: float, image: UInt8 | None) -> TrackedFrame:
         view = self._extend_tracks(matched, time)
+        if image is not None and self._refines:
+            view.image = prepared(image)
         if self._mapper is None:
             mapper: type[Mapper] = RobustMapper if self._settings.mode == "robust" else PaperMapper
             distance = self._max_distance(matched.features)
@@ -231,6 +239,12 @@ class VisualOdometry:
 
     def _max_distance(self, features: Features) -> float:
         return distance_threshold(features, self._settings.matching.max_distance)
+
+
+def _is_refined(frontend: Frontend, settings: RefinementSettings) -> bool:
+    """Whether keypoints of a frontend are to be refined; one without a name counts as a network."""
+    classical = getattr(frontend, "name", "") in CLASSICAL
+    return settings.frontends == "all" or (settings.frontends == "networks" and not classical)
 
 
 def _read_only(pose: Float64 | None) -> Float64 | None:

@@ -17,6 +17,7 @@ from improvo.report.true_path import TruePath, true_path
 from improvo.types import SparseMap, UInt8
 
 _BACKGROUND = "#565b63"  # neither the paper's black (last window) nor its white (points)
+_DOUBTED = "#ff4fd8"  # a band under the path, which no ramp of the palettes has
 LAST_POSES = 30  # N_last
 _DARKEST = 70  # grey level in which black points are drawn
 
@@ -77,6 +78,10 @@ def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: in
     )
     axis.add_collection(
         LineCollection(list(links[~joined]), colors="white", linewidths=1.0, linestyles="dotted", zorder=2)
+    )
+    doubted = (run.doubtful | run.uncertain)[1:] & joined
+    axis.add_collection(
+        LineCollection(list(links[doubted]), colors=_DOUBTED, linewidths=8.0, capstyle="round", alpha=0.8, zorder=2)
     )
     last = path_2d[-last_poses:]
     axis.plot(*last.T, color="white", linewidth=5.5, solid_capstyle="round", zorder=4)
@@ -141,6 +146,8 @@ def _title(run: RunFolder, points: int, outside: int, truth: TruePath | None) ->
         parts.append(f"{outside} far ones outside the picture")
     if truth is not None:
         parts.append(f"{truth.text} off the true one")
+    if (run.doubtful | run.uncertain).any():
+        parts.append("doubtful where the band is pink")
     if len(segments) > 1:
         own = "" if run.unit.startswith("metres") else "each with its own scale, "
         parts.append(f"{len(segments)} segments, {own}placed by guess")

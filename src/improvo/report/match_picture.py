@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from improvo.evaluation.pose.estimators import with_poselib
+from improvo.evaluation.pose.estimators import with_robust_solver
 from improvo.frontend import Frontend
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
@@ -83,7 +83,7 @@ def carry(a: Features, b: Features, matches: Int64, depth_a: Float32 | None, cam
     known = matches[np.isfinite(depth)]
     points = camera.unproject(a.keypoints[known[:, 0]].astype(np.float64), depth[np.isfinite(depth)])
     pixels = b.keypoints[known[:, 1]].astype(np.float64)
-    estimate = with_poselib(points, pixels, camera, seed=0)
+    estimate = with_robust_solver(points, pixels, camera, seed=0)
     if estimate is None:
         return _nothing("no pose was found")
     points_b = se3.transform(estimate.cam_from_world, points)
@@ -95,7 +95,8 @@ def carry(a: Features, b: Features, matches: Int64, depth_a: Float32 | None, cam
 
 
 def _carry_along_epipolar_lines(a: Features, b: Features, matches: Int64, camera: Camera) -> Carried:
-    from improvo.geometry.two_view import Ransac, epipolar_lines, relative_pose
+    from improvo.geometry.epipolar import epipolar_lines
+    from improvo.geometry.ransac import Ransac, relative_pose
 
     pixels_a = a.keypoints[matches[:, 0]].astype(np.float64)
     pixels_b = b.keypoints[matches[:, 1]].astype(np.float64)

@@ -53,6 +53,7 @@ def scene_data(run: RunFolder, palette: Palette, truth: TruePath | None = None) 
         "truth": None if truth is None else _base64((truth.centers @ scene_from_world.T).astype("<f4")),
         "frame_indices": run.frame_indices.tolist(),
         "segments": trajectory.segment.tolist(),
+        "doubted": (run.doubtful | run.uncertain).tolist(),
         "frames": run.frames,
         "last": min(LAST_POSES, max(len(trajectory) - 1, 0)),
         "centre": centre,

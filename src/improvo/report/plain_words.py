@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from improvo.odometry.told_verdicts import verdict_lines
+from improvo.odometry.verdict import DOUBTFUL
 from improvo.types import Float64, Int64
 
 _DARK = 25.0  # mean grey value below which keypoints become rare
@@ -28,6 +30,7 @@ def warnings(report: dict[str, Any], shown: Int64, brightness: Float64, median_e
         lines.append(
             "No frame has a pose: the camera moved too little, only turned, or saw too little texture. Move sideways."
         )
+    lines += [f"{line[0].upper()}{line[1:]}." for line in verdict_lines(report) if f" is {DOUBTFUL}" in line]
     lines += _events(report)
     if frames["lost"]:
         lines.append(f"{frames['lost']} of {frames['processed']} frames have no pose: {ranges(frames['lost_frames'])}.")
@@ -64,7 +67,8 @@ def _events(report: dict[str, Any]) -> list[str]:
     if waiting and report["frames"]["lost"]:  # frames that only waited get their pose once the map has begun
         last = waiting[-1]
         lines.append(f"The map could not begin; the last reason, at frame {last['frame_index']}: {last['detail']}.")
-    by_kind.pop("segment", None)  # said by the number of segments
+    for kind in ("segment", "doubtful"):  # said by the number of segments, and by their verdicts
+        by_kind.pop(kind, None)
     for kind, events in by_kind.items():
         lines.append(f"{kind.capitalize()} at frame {events[0]['frame_index']}: {events[0]['detail']}.")
     return lines

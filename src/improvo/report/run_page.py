@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from improvo.errors import InputError
 from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.told_verdicts import verdict_lines, verdict_of
+from improvo.odometry.verdict import DOUBTFUL
 from improvo.report.charts import line_chart
 from improvo.report.map_picture import map_png
 from improvo.report.page import Page
@@ -26,7 +29,7 @@ _SCENE = """
 <label><input type="radio" name="layer" value="labels"> points by label</label>
 <button type="button" id="scene-reset">Reset</button><button type="button" id="scene-above">From above</button>
 <span class="legend">trajectory: first <i class="ramp" style="background:{gradient}"></i> last; black: last window;
-yellow: the frame below{truth}</span></div>
+pink: doubtful; yellow: the frame below{truth}</span></div>
 <canvas class="scene" id="scene" tabindex="0" aria-label="3D map: drag to turn, shift-drag to move, wheel to zoom">
 </canvas>
 <p class="note only-screen">Drag turns, shift or right button moves, the wheel zooms after a click on the map, two
@@ -75,6 +78,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
         [
             (f"{frames['tracked']} of {frames['processed']}", "frames with a pose"),
             (str(len(report["segments"])), "segments (1 is best)"),
+            *_verdict_tile(report),
             (f"{report['points']:,}", "map points"),
             *([(f"{_path_length(run):.4g} m", "path of the camera")] if report.get("metric") else []),
             *([(f"{truth.ate_percent:.2g} %", "of the path off the true one (ATE)")] if truth is not None else []),
@@ -85,6 +89,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
     )
     page.heading("What to look out for")
     page.warnings(warnings(report, shown, brightness, median_error), "Nothing: every frame has a pose, in one segment.")
+    page.paragraph(" ".join(f"{line[0].upper()}{line[1:]}." for line in verdict_lines(report)))
     if len(run.trajectory):
         _map_section(page, run, palette, truth)
     _frames_section(page, run, data, palette, missing)
@@ -92,6 +97,16 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
     _labels_section(page, run)
     _timing_section(page, run)
     page.write(path)
+
+
+def _verdict_tile(report: dict[str, Any]) -> list[tuple[str, str]]:
+    """What the odometry itself thinks of its path: the worst segment counts."""
+    errors = [verdict_of(segment)["error_percent"] for segment in report["segments"]]
+    known = [error for error in errors if error is not None]
+    if not known:
+        return []
+    doubtful = any(verdict_of(segment)["word"] == DOUBTFUL for segment in report["segments"])
+    return [(f"{max(known):.1f} %", "estimated error of the path" + (": doubtful" if doubtful else ""))]
 
 
 def _path_length(run: RunFolder) -> float:
@@ -108,7 +123,7 @@ def _map_section(page: Page, run: RunFolder, palette: Palette, truth: TruePath |
     page.picture(
         map_png(run, palette),
         f"Seen from above: points as the recording shows them, the trajectory {colours} over time, the last window "
-        "black.",
+        "black, a pink band under what is doubtful.",
     )
 
 

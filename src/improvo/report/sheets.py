@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +14,11 @@ from improvo.report.canvas import stacked
 from improvo.types import UInt8
 from improvo.untrusted.paths import is_text
 
-# Codecs that OpenCV's wheels can write into MP4: VP9 plays in browsers, MPEG-4 is the fallback.
-_CODECS = ("vp09", "mp4v")
+# What OpenCV's wheels can write, by the suffix of the file. MPEG-4 takes a millisecond for a picture of 540x360 where
+# VP8 takes thirty and VP9 a hundred, but browsers play only those two.
+_CODECS = {".mp4": ("mp4v", "vp09"), ".webm": ("VP80", "vp09")}
+_ANIMATIONS = (".gif", ".webp")  # by Pillow; for a page or a README
+MOVING = (*_CODECS, *_ANIMATIONS)
 
 
 def write_sheet(path: Path, pictures: Sequence[UInt8], columns: int | None = None) -> None:
@@ -24,19 +28,28 @@ def write_sheet(path: Path, pictures: Sequence[UInt8], columns: int | None = Non
     write_png(path, stacked(list(pictures), columns or max(1, best)))
 
 
-def write_video(path: Path, pictures: Iterable[UInt8], fps: float) -> None:
-    """Write pictures of one size as an MP4.
+def write_video(path: Path, pictures: Iterable[UInt8], fps: float, width: int | None = None) -> None:
+    """Write pictures of one size as a moving one: MP4 (MPEG-4), WebM (VP8), or an animated GIF or WebP.
+
+    Args:
+        path: its suffix, one of `MOVING`, says which.
+        pictures: RGB.
+        fps: pictures a second.
+        width: pixels, to make them smaller; None keeps their size.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    pictures = iter(pictures)
+    pictures = (_resized(picture, width) for picture in pictures)
+    if path.suffix.lower() in _ANIMATIONS:
+        _write_animation(path, pictures, fps)
+        return
     first = next(pictures)
     height, width = (side - side % 2 for side in first.shape[:2])  # codecs want even sides
     with written_atomically(path) as temporary:
-        writer = _writer(temporary, max(fps, 1.0), width, height)
+        writer = _writer(temporary, _CODECS.get(path.suffix.lower(), ()), max(fps, 1.0), width, height)
         if writer is None:
-            raise OutputError(f"{path}: OpenCV cannot write a video here; leave out --video to get PNG files")
+            raise OutputError(f"{path}: OpenCV cannot write such a video here; try .mp4, or a folder for PNG files")
         try:
             for rgb in _chain(first, pictures):
                 writer.write(np.ascontiguousarray(rgb[:height, :width, ::-1]))
@@ -44,7 +57,26 @@ def write_video(path: Path, pictures: Iterable[UInt8], fps: float) -> None:
             writer.release()
 
 
-def _writer(path: Path, fps: float, width: int, height: int) -> cv2.VideoWriter | None:  # type: ignore[name-defined] # noqa: F821
+def _resized(picture: UInt8, width: int | None) -> UInt8:
+    if width is None or width >= picture.shape[1]:
+        return picture
+    import cv2
+
+    height = round(picture.shape[0] * width / picture.shape[1])
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _write_animation(path: Path, pictures: Iterator[UInt8], fps: float) -> None:
+    """All pictures are in memory at once: these formats are for short ones."""
+    from PIL import Image
+
+    first, *others = (Image.fromarray(picture) for picture in pictures)
+    more: dict[str, Any] = {"quality": 60, "method": 4} if path.suffix.lower() == ".webp" else {}
+    with written_atomically(path) as temporary:
+        first.save(temporary, save_all=True, append_images=others, duration=round(1000 / max(fps, 1.0)), loop=0, **more)
+
+
+def _writer(path: Path, codecs: tuple[str, ...], fps: float, width: int, height: int) -> cv2.VideoWriter | None:  # type: ignore[name-defined] # noqa: F821
     import cv2
 
     if not is_text(path):  # OpenCV ends the process
@@ -55,7 +87,7 @@ def _writer(path: Path, fps: float, width: int, height: int) -> cv2.VideoWriter 
     if log:
         log.setLogLevel(log.LOG_LEVEL_SILENT)
     try:
-        for codec in _CODECS:
+        for codec in codecs:
             writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), fps, (width, height))
             if writer.isOpened():
                 return writer

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from improvo.geometry.camera import Camera
-from improvo.geometry.two_view import Ransac, relative_pose, sampson_errors
+from improvo.geometry.epipolar import sampson_errors
+from improvo.geometry.ransac import Ransac, relative_pose
 from improvo.self_calibration.lens import Lens, lens_with_fov
 from improvo.self_calibration.raw_features import Piece
 from improvo.tracking.matching import distance_threshold, match_units, unit_descriptors

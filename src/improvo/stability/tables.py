@@ -10,6 +10,7 @@ is sorted by track, what `read_tracks` returns by track, then frame.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -22,10 +23,8 @@ from numpy.typing import NDArray
 from improvo.errors import InputError
 from improvo.files import written_atomically
 from improvo.stability.rule import STABILITY_NAMES, TrackLabels
+from improvo.stability.table_reading import read_parts, read_table
 from improvo.types import Float32, Float64, Int64
-from improvo.untrusted.arrays import check_array
-from improvo.untrusted.limits import MAX_TABLE_BYTES
-from improvo.untrusted.text import reason
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -246,7 +245,20 @@ def read_points(path: Path) -> PointsTable:
     Raises:
         InputError: missing, no Parquet, or without the columns that `improvo run` and `improvo label` write.
     """
-    table = read_table(path, points_schema())
+    return _points(path, read_table(path, points_schema())).in_order()
+
+
+def read_points_parts(path: Path) -> Iterator[PointsTable]:
+    """`points.parquet` a row group at a time, in the order of the file.
+
+    Raises:
+        InputError: as `read_points`.
+    """
+    for part in read_parts(path, points_schema()):
+        yield _points(path, part)
+
+
+def _points(path: Path, table: pa.Table) -> PointsTable:
     names = np.array(table["stability"].to_pylist(), dtype=object)
     codes = np.full(len(names), -1, np.int8)
     for code, name in enumerate(STABILITY_NAMES):
@@ -264,7 +276,7 @@ def read_points(path: Path) -> PointsTable:
         table["segment"].to_numpy().astype(np.int64),
         table["parallax"].to_numpy(),
         table["withheld"].to_numpy().astype(np.bool_),
-    ).in_order()
+    )
 
 
 def read_tracks(path: Path) -> TracksTable:
@@ -283,34 +295,38 @@ def read_tracks(path: Path) -> TracksTable:
     ).in_order()
 
 
-def read_table(path: Path, schema: pa.Schema) -> pa.Table:
-    """The columns of a schema, as it has them, and none of them with gaps.
+@dataclass(frozen=True)
+class Observations:
+    """Some observations: what of them tells how good the odometry was."""
+
+    frame: Int64  # (M,)
+    track: Int64  # (M,)
+    error: Float32  # (M,) pixels; NaN where there is none
+
+    @staticmethod
+    def joined(parts: Iterable[Observations]) -> Observations:
+        """All of them."""
+        kept = list(parts)
+        nothing = Observations(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32))
+        names = (field.name for field in fields(Observations))
+        return Observations(*(np.concatenate([getattr(part, name) for part in (nothing, *kept)]) for name in names))
+
+
+def read_observations(path: Path, frames: range | None = None) -> Iterator[Observations]:
+    """`tracks.parquet` a row group at a time, in the order of the file.
+
+    Args:
+        path: of the table.
+        frames: whose observations to read; all if None.
 
     Raises:
-        InputError: missing, no Parquet, other columns, or many more rows than the file can hold.
+        InputError: as `read_tracks`.
     """
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
-    try:
-        file = pq.ParquetFile(path)
-        missing = [name for name in schema.names if name not in file.schema_arrow.names]
-        if missing:
-            raise InputError(f"{path}: lacks the column(s) {', '.join(missing)}; write it again with this version")
-        check_array("rows", (file.metadata.num_rows,), 8 * len(schema.names), _most_bytes(path.stat().st_size))
-        table = file.read(columns=schema.names).select(schema.names).cast(schema)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; `improvo run` and `improvo label` write it") from None
-    except (pa.ArrowException, OSError, ValueError, LookupError, TypeError, MemoryError) as error:
-        raise InputError(f"{path}: cannot be read as Parquet ({reason(error)}); write it again") from None
-    gaps = [name for name in schema.names if table[name].null_count]
-    if gaps:
-        raise InputError(f"{path}: has rows without {', '.join(gaps)}; write it again")
-    if any((table[name].to_numpy() < 0).any() for name in ("track", "frame") if name in schema.names):
-        raise InputError(f"{path}: has rows with a negative number; write it again")
-    return table
-
-
-def _most_bytes(file_bytes: int) -> int:
-    """What a file may hold: compression makes less of our tables, but not a thousandth."""
-    return min(MAX_TABLE_BYTES, 1000 * file_bytes + (1 << 24))
+    columns = pa.schema([tracks_schema().field(name) for name in ("frame", "track", "error")])
+    between = ("frame", frames.start, frames.stop - 1) if frames is not None else None
+    for part in read_parts(path, columns, between):
+        frame, track, error = (part[name].to_numpy() for name in columns.names)
+        rows = slice(None) if frames is None else np.flatnonzero((frame >= frames.start) & (frame < frames.stop))
+        yield Observations(frame[rows].astype(np.int64), track[rows], error[rows])

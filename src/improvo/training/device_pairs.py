@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,19 +11,20 @@ from torch import Tensor
 
 from improvo.errors import InputError
 from improvo.frontend.architecture import CELL
+from improvo.training.alignment import aligned
 from improvo.training.distributed import Process
+from improvo.training.held_settings import HeldSettings
 from improvo.training.labels import DUSTBIN
 from improvo.training.photometric_batch import augment_batch
-from improvo.training.picture_store import DepthStore, PictureStore, on_device
-from improvo.training.pictures import Pictures
+from improvo.training.picture_store import MaskStore, PictureStore, on_device
+from improvo.training.pictures import Pictures, Source
 from improvo.training.posed import PosedSequence, overlapping_pairs
+from improvo.training.posed_frames import PosedFrames
 from improvo.training.random_views import random_views
-from improvo.training.settings import HeldSettings
+from improvo.training.teacher import Teacher
 from improvo.training.views import inside, warp_points
 from improvo.types import Float64, Int64
 
-# views (V, 1, H, W) in [0, 1] -> logits (V, C, Hc, Wc)
-Teacher = Callable[[Tensor], Tensor]
 _SPREAD = 1.0  # of the random part of a keypoint's score, beside the logarithm of its probability
 
 
@@ -42,8 +43,9 @@ class DevicePairs:
     """Batch number i, always the same for the same seed on the same device: (2B) images, first the a views.
 
     A batch has `images` (2B, 1, H, W) uint8, `points_a`, `points_b` (B, N, 2) float32 pixels that show the same place,
-    `valid` (B, N) bool, `scenes` (B,) int64, `detector` (2B, 65, Hc, Wc) the logits that are held to, and, with a
-    teacher of stability, `stability` (2B / every, 2, Hc, Wc).
+    `valid` (B, N) bool, `scenes` (B,) int64, `detector` (2B, 65, Hc, Wc) the logits that are held to, with a
+    teacher of stability `stability` (2B / every, 2, Hc, Wc), and with frozen layers `stem` (2B, C, h, w), what these
+    make of the images.
 
     Args:
         pictures: homography pairs are made of these, and of the frames of `posed`.
@@ -68,15 +70,12 @@ class DevicePairs:
         frames = [picture for sequence in posed for picture in sequence.pictures]
         singles = [picture for source in pictures.sources for picture in source.pictures]
         self.store = PictureStore([*frames, *singles], device)
-        self.depths = _depth_store(posed, device)
-        self.first_frame = np.cumsum([0, *(len(sequence.pictures) for sequence in posed)])
+        self.masks = _mask_store([*posed, *pictures.sources], self.store, device)
+        self.frames = PosedFrames(posed, device)
         self.first_picture = len(frames) + np.cumsum([0, *(len(source.pictures) for source in pictures.sources)])
         self.pairs = [overlapping_pairs(sequence, settings.pairs) for sequence in posed]
+        self.weights = np.array([sequence.weight for sequence in posed])
         self.useful = [row for row, pairs in enumerate(self.pairs) if pairs is not None]
-        counts = [len(sequence.pictures) for sequence in posed]
-        K = [np.broadcast_to(s.K, (n, 3, 3)) for s, n in zip(posed, counts, strict=True)]
-        self.K = np.concatenate([np.zeros((0, 3, 3)), *K])
-        self.poses = np.concatenate([np.zeros((0, 4, 4)), *(sequence.world_from_cam for sequence in posed)])
         self.process = Process.current()
 
     def __len__(self) -> int:
@@ -100,9 +99,11 @@ class DevicePairs:
     def taught(self, images: Tensor) -> dict[str, Tensor]:
         """What the teachers say of views (V, 1, H, W) uint8: `detector` and, with a teacher of it, `stability`."""
         network_input = (images.float() / 255).contiguous(memory_format=torch.channels_last)
-        said = {"detector": self.detector(network_input)}
-        if self.stability is not None:
-            said["stability"] = self.stability(network_input[:: self.settings.stability_every])
+        frozen = self.settings.frozen_layers
+        logits, stem = self.detector(network_input, frozen)
+        said = {"detector": logits, **({"stem": stem} if frozen else {})}
+        if self.stability is not None and not self.settings.holds_by_itself:
+            said["stability"] = self.stability(network_input[:: self.settings.stability_every])[0]
         return said
 
     def _plan(self, rng: np.random.Generator, count: int) -> _Plan:
@@ -113,15 +114,14 @@ class DevicePairs:
         rows, scenes = np.zeros((count, 2), np.int64), np.zeros(count, np.int64)
         b_from_a = np.tile(np.eye(3), (count, 1, 1))
         centres = np.full((2, count, 2), np.nan)
-        turns = -(-posed // max(len(self.useful), 1))  # every sequence once before any comes again
-        order = [int(scene) for _ in range(turns) for scene in rng.permutation(self.useful)]
+        order = self._scenes(rng, posed)
         for pair in range(count):
             if pair < posed:
                 scene = scenes[pair] = order[pair]
                 pairs = self.pairs[scene]
                 assert pairs is not None
                 a, b, centres[0, pair], centres[1, pair] = pairs.draw(rng)
-                rows[pair] = self.first_frame[scene] + np.array([a, b if settings.two_frames else a])
+                rows[pair] = self.frames.first[scene] + np.array([a, b if settings.two_frames else a])
             else:
                 source, a, b, b_from_a[pair] = self._picture_pair(rng)
                 scenes[pair] = len(self.pairs) + source
@@ -132,6 +132,14 @@ class DevicePairs:
         self._look_there(H_a, b_from_a, rows, sizes, centres[1], related)
         H_b = random_views(rng, self.settings.views, sizes[:, 1], centres[1])
         return _Plan(rows, scenes, b_from_a, np.concatenate([H_a, H_b]), related)
+
+    def _scenes(self, rng: np.random.Generator, count: int) -> list[int]:
+        """Which sequences the pairs are of: every one once before any comes again, or, of different weights, drawn."""
+        weights = self.weights[self.useful]
+        if count and (weights != weights[0]).any():
+            return [int(scene) for scene in rng.choice(self.useful, count, p=weights / weights.sum())]
+        turns = -(-count // max(len(self.useful), 1))
+        return [int(scene) for _ in range(turns) for scene in rng.permutation(self.useful)]
 
     def _picture_pair(self, rng: np.random.Generator) -> tuple[int, int, int, Float64]:
         """Source, two of its pictures, and the homography between them; mostly one picture twice."""
@@ -180,8 +188,11 @@ class DevicePairs:
         )
         valid = visible.gather(1, chosen)
         where = chosen[..., None].expand(-1, -1, 2)
+        points_a = candidates.gather(1, where)
         points_b = torch.where(valid[..., None], carried.gather(1, where), 0.0)
-        return {"points_a": candidates.gather(1, where), "points_b": points_b, "valid": valid}
+        if settings.aligned and plan.posed:
+            points_b, valid = self._by_pictures(plan, points_a, points_b, valid)
+        return {"points_a": points_a, "points_b": points_b, "valid": valid}
 
     def _carry(self, plan: _Plan, points: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels of view b (B, N, 2) of pixels of view a, and whether both pictures show the place."""
@@ -190,37 +201,41 @@ class DevicePairs:
         in_b = _warped(plan.b_from_a, in_a)
         visible = torch.ones_like(in_a[..., 0], dtype=torch.bool)
         if plan.posed:
-            in_b[: plan.posed], visible[: plan.posed] = self._through_depth(plan.rows[: plan.posed], in_a[: plan.posed])
+            rows = plan.rows[: plan.posed]
+            inverse = self.frames.depths.sample(rows[:, 0], in_a[: plan.posed])
+            carried = self.frames.carry(rows, in_a[: plan.posed], inverse)
+            in_b[: plan.posed] = carried.places
+            visible[: plan.posed] = self.frames.shown(rows, carried, self.settings.pairs.depth_tolerance)
         sizes = on_device(self.store.sizes[plan.rows].astype(np.float32), points.device)
         visible = visible & _within(in_a, sizes[:, 0]) & _within(in_b, sizes[:, 1])
+        if self.masks is not None:
+            visible = visible & self.masks.used(plan.rows[:, 0], in_a) & self.masks.used(plan.rows[:, 1], in_b)
         result = _warped(plan.view_from_picture[count:], torch.where(visible[..., None], in_b, 0.0))
         return result, visible & _within(
             result, on_device(np.array([[views.width, views.height]], np.float32), points.device)
         )
 
-    def _through_depth(self, rows: Int64, in_a: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels of frames b of pixels (P, N, 2) of frames a, by depth and poses, and whether nothing hides them."""
-        inverse_K = np.linalg.inv(self.K[rows[:, 0]])
-        b_from_a = np.linalg.inv(self.poses[rows[:, 1]]) @ self.poses[rows[:, 0]]
-        turned = self.K[rows[:, 1]] @ b_from_a[:, :3, :3] @ inverse_K  # pixels of b per pixel of a and unit depth
-        moved = (self.K[rows[:, 1]] @ b_from_a[:, :3, 3:])[..., 0]
-        A, t = (on_device(part, in_a.device) for part in (turned, moved))
-        inverse = self.depths.sample(rows[:, 0], in_a)
-        seen = torch.cat([in_a, torch.ones_like(in_a[..., :1])], dim=-1)
-        seen = (seen[:, :, None] * A[:, None]).sum(dim=-1) + inverse[..., None] * t[:, None]  # over the depth in a
-        ahead = (inverse > 0) & (seen[..., 2] > 1e-3)
-        in_b = torch.where(ahead[..., None], seen[..., :2] / torch.where(ahead, seen[..., 2], 1.0)[..., None], -1.0)
-        expected = inverse / torch.where(ahead, seen[..., 2], 1.0)  # inverse depth in b
-        found = self.depths.sample(rows[:, 1], in_b)
-        agrees = (expected - found).abs() < self.settings.pairs.depth_tolerance * found
-        return in_b, ahead & agrees
+    def _by_pictures(self, plan: _Plan, points_a: Tensor, points_b: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """Partners (B, N, 2) of pixels of the a views, and which are known: by depth, and as the pictures have them."""
+        views, posed = self.settings.views, plan.posed
+        rows = plan.rows[:posed]
+        in_a = _warped(np.asarray(np.linalg.inv(plan.view_from_picture[:posed])), points_a[:posed])
+        inverse = torch.where(valid[:posed], self.frames.depths.sample(rows[:, 0], in_a), 0.0)
+        found = aligned(self.store, self.frames, rows, in_a, inverse, self.settings.pairs.align)
+        kept = valid[:posed] & ~found.contradicted
+        moved = _warped(plan.view_from_picture[len(valid) : len(valid) + posed], found.places)
+        size = on_device(np.array([[views.width, views.height]], np.float32), moved.device)
+        kept = kept & _within(moved, size)
+        points_b = torch.cat([torch.where(kept[..., None], moved, 0.0), points_b[posed:]])
+        return points_b, torch.cat([kept, valid[posed:]])
 
 
-def _depth_store(posed: Sequence[PosedSequence], device: torch.device) -> DepthStore:
-    maps = [values for sequence in posed for values in sequence.inverse_depth]
-    sizes = [sequence.size for sequence in posed for _ in sequence.inverse_depth]
-    scales = np.array([(w / m.shape[1], h / m.shape[0]) for (w, h), m in zip(sizes, maps, strict=True)]).reshape(-1, 2)
-    return DepthStore(maps, scales, device)
+def _mask_store(runs: Sequence[PosedSequence | Source], store: PictureStore, device: torch.device) -> MaskStore | None:
+    """Of all pictures; None where none has a mask."""
+    if not any(run.masks for run in runs):
+        return None
+    masks = [mask for run in runs for mask in (run.masks or (None,) * len(run.pictures))]
+    return MaskStore(masks, store.sizes[: store.count], device)
 
 
 def _warped(H: Float64, points: Tensor) -> Tensor:

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from improvo.frontend.superpoint import SuperPoint, sample_descriptors
+from improvo.training.held_settings import HeldSettings
 from improvo.training.losses import held_loss, info_nce_loss
-from improvo.training.settings import HeldSettings
 from improvo.training.stage import Stage
 
 
@@ -22,6 +22,12 @@ class HeldStage(Stage):
         super().__init__()
         self.network = network
         self.settings = settings
+        for parameter in network.encoder[: settings.frozen_layers].parameters():
+            parameter.requires_grad_(False)
+        if settings.holds_by_itself:
+            for head in (network.detector, network.stability):
+                if head is not None:
+                    head.requires_grad_(False)
         self.log_scale = nn.Parameter(torch.tensor(math.log(20.0)))  # inverse temperature of the InfoNCE loss
         self._compiled: Any = None
 
@@ -29,8 +35,9 @@ class HeldStage(Stage):
         """See `Stage`; `batch` is that of `DevicePairs`."""
         settings = self.settings
         if self._compiled is None:  # not before the average was copied from this
-            self._compiled = torch.compile(self._all_heads) if settings.compile else self._all_heads
-        detector_logits, descriptors, stability_logits = self._compiled(batch["images"])
+            self._compiled = torch.compile(self._heads) if settings.compile else self._heads
+        seen = batch["stem"] if settings.frozen_layers else batch["images"]
+        detector_logits, descriptors, stability_logits = self._compiled(seen)
         with torch.autocast(descriptors.device.type, enabled=False):
             first, second = functional.normalize(descriptors.float(), dim=1).chunk(2)
             points_a, points_b = batch["points_a"], batch["points_b"]
@@ -40,9 +47,10 @@ class HeldStage(Stage):
                 a, b, points_a, points_b, batch["valid"], scale, settings.masked_pixels,
                 negative=batch.get("negative"), group=math.gcd(settings.pairs.group, len(a)), scenes=batch["scenes"],
             )  # fmt: skip
-            detector = held_loss(detector_logits, batch["detector"])
-            total = settings.descriptor_weight * descriptor + settings.detector_weight * detector
-            result = {"descriptor": descriptor, "detector": detector}
+            total, result = settings.descriptor_weight * descriptor, {"descriptor": descriptor}
+            if detector_logits is not None:
+                detector = held_loss(detector_logits, batch["detector"])
+                total, result["detector"] = total + settings.detector_weight * detector, detector
             if stability_logits is not None and "stability" in batch:
                 stability = held_loss(stability_logits[:: settings.stability_every], batch["stability"])
                 total = total + settings.stability_weight * stability
@@ -52,8 +60,11 @@ class HeldStage(Stage):
         correspondences = batch["valid"].sum(dim=1).float().mean()
         return {"loss": total, **result, "right": right, "scale": scale, "correspondences": correspondences}
 
-    def _all_heads(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        shared = self.network.encode(images)
+    def _heads(self, seen: Tensor) -> tuple[Tensor | None, Tensor, Tensor | None]:
+        """Of images, or of what the frozen layers make of them; None for heads that need not be held."""
+        shared = self.network.encode(seen, self.settings.frozen_layers)
+        if self.settings.holds_by_itself:
+            return None, self.network.descriptor(shared), None
         stability = None if self.network.stability is None else self.network.stability(shared)
         return self.network.detector(shared), self.network.descriptor(shared), stability
 

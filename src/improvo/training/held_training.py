@@ -9,20 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from improvo.errors import InputError
 from improvo.frontend.channel_pruning import without_dead_channels
-from improvo.frontend.runtime_torch import load_network
 from improvo.frontend.superpoint import SuperPoint
 from improvo.frontend.weights import DataSource, Weights, load_weights
-from improvo.training.device_pairs import DevicePairs, Teacher
+from improvo.training.device_pairs import DevicePairs
 from improvo.training.held import HeldStage
+from improvo.training.held_settings import HeldSettings
 from improvo.training.networks import started_network
 from improvo.training.pictures import Pictures
 from improvo.training.posed import PosedSequence
-from improvo.training.settings import HeldSettings
 from improvo.training.stage_folder import model_card, run_stage
+from improvo.training.teacher import network_teacher
 from improvo.training.trainer import Batches, choose_device, choose_precision
 
 
@@ -59,7 +58,7 @@ def train_held(
         pictures, posed, settings, network_teacher(parent, "detector", device, precision),
         network_teacher(stability, "stability", device, precision) if stability else None, device,
     )  # fmt: skip
-    batches = _with_tracks(dense, labels)
+    batches = _with_tracks(dense, labels, output)
     if not data:
         names = (*(source.name for source in pictures.sources), *(sequence.name for sequence in posed))
         data = tuple(DataSource(name, "not stated") for name in names)
@@ -76,31 +75,17 @@ def train_held(
     return run_stage(HeldStage(network, settings), batches, settings, output, card, progress, left)
 
 
-def _with_tracks(dense: DevicePairs, labels: Sequence[Path]) -> Batches:
+def _with_tracks(dense: DevicePairs, labels: Sequence[Path], output: Path) -> Batches:
     from improvo.labeling.labeled import read_labels
-    from improvo.training.labeled_frames import LabeledFrames
+    from improvo.training.label_library import LabelLibrary
     from improvo.training.mixed_pairs import MixedPairs, tracked_settings
     from improvo.training.tracked_pairs import TrackedPairs
 
     settings = tracked_settings(dense.settings)
     sequences = [sequence for folder in labels for sequence in read_labels(folder)]
-    frames = [LabeledFrames(sequence, settings.longer_side, settings.landmarks) for sequence in sequences]
-    useful = [labelled for labelled in frames if len(labelled.useful_frames(settings.pairs.least_points))]
-    return MixedPairs(dense, TrackedPairs(useful, settings)) if useful else dense
-
-
-def network_teacher(weights: Weights, head: str, device: torch.device, precision: torch.dtype) -> Teacher:
-    """One head of a network that is not trained, on views (V, 1, H, W): logits (V, C, Hc, Wc)."""
-    network = load_network(without_dead_channels(weights)).requires_grad_(False)
-    network = network.to(device, memory_format=torch.channels_last)
-    chosen = getattr(network, head)
-
-    def look(views: Tensor) -> Tensor:
-        with torch.no_grad(), torch.autocast(device.type, torch.bfloat16, enabled=precision == torch.bfloat16):
-            logits: Tensor = chosen(network.encode(views))
-        return logits.float()
-
-    return look
+    frames = LabelLibrary(sequences, settings.longer_side, settings.landmarks, output, settings.memory_mib)
+    tracked = TrackedPairs(frames, settings)
+    return MixedPairs(dense, tracked) if tracked.useful_frames else dense
 
 
 def _student(parent: Weights, stability: Weights | None, settings: HeldSettings) -> SuperPoint:

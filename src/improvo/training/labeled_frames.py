@@ -1,6 +1,6 @@
 """A labeled sequence by frames: the points that a frame shows, and where another frame shows the same ones.
 
-A *landmark* is a map point with all of its tracks, or a track without a map point. Correspondences are of landmarks.
+Correspondences are of landmarks (`improvo.training.landmarks`).
 Beyond the paper, a stable landmark is also known in frames where no track observed it, if its projection is visible.
 """
 
@@ -15,13 +15,10 @@ from numpy.typing import NDArray
 from improvo.frontend.masking import unmasked
 from improvo.geometry.se3 import transform
 from improvo.labeling.labeled import LabeledSequence
-from improvo.stability.grouping import medians, rows_of
-from improvo.stability.rule import IGNORE, STABLE, UNSTABLE
+from improvo.stability.rule import STABLE
+from improvo.training.landmarks import Codes, Landmarks, Summary, find_landmarks
 from improvo.training.settings import LandmarkSettings
-from improvo.training.wrong_links import largest_step_shares
-from improvo.types import Float32, Float64, Int64, Mask, UInt8
-
-Codes = NDArray[np.int8]
+from improvo.types import Float64, Int64, Mask, UInt8
 
 
 @dataclass(frozen=True)
@@ -41,21 +38,24 @@ class LabeledFrames:
         sequence: finished labels.
         longer_side: pixels; larger frames are reduced, and points with them.
         settings: what a landmark is.
+        landmarks: of the sequence; found from its tables if None.
     """
 
-    def __init__(self, sequence: LabeledSequence, longer_side: int, settings: LandmarkSettings) -> None:
+    def __init__(
+        self,
+        sequence: LabeledSequence,
+        longer_side: int,
+        settings: LandmarkSettings,
+        landmarks: Landmarks | None = None,
+    ) -> None:
         self.sequence, self.settings = sequence, settings
-        camera = sequence.camera
+        self.landmarks = landmarks or find_landmarks(sequence, settings)
+        camera = self.landmarks.camera
         self.scale = min(1.0, longer_side / max(camera.width, camera.height))
         self.size = round(camera.width * self.scale), round(camera.height * self.scale)  # width, height
-        frames = sequence.frames
-        self._poses = sequence.cam_from_world
-        self._usable = frames.trusted & (frames.segment >= 0)
-        self._index_observations()
-        self._mean_direction, self._mean_distance = self._viewpoints()
 
     def __len__(self) -> int:
-        return len(self.sequence.frames)
+        return len(self.landmarks)
 
     def picture(self, frame: int) -> UInt8:
         """The grey training picture (H, W)."""
@@ -71,16 +71,14 @@ class LabeledFrames:
             return None
         return np.asarray(cv2.resize(mask.astype(np.uint8) * 255, self.size, interpolation=cv2.INTER_AREA) == 255)
 
-    def useful_frames(self, least: int) -> Int64:
-        """Frames whose tracks have at least `least` stable points."""
-        stable = self._stability[self._landmark] == STABLE
-        frame = np.repeat(np.arange(len(self)), np.diff(self._start))
-        return np.flatnonzero(np.bincount(frame[stable], minlength=len(self)) >= least)
+    def summary(self) -> Summary:
+        """What is known of the sequence without drawing from it."""
+        return self.landmarks.summary()
 
     def points(self, frame: int) -> FramePoints:
         """All points that a frame is known to show: observed ones, and stable landmarks that are visible in it."""
-        rows = slice(self._start[frame], self._start[frame + 1])
-        landmark, places = self._landmark[rows], self._keypoints[rows].astype(np.float64)
+        landmarks = self.landmarks
+        landmark, places = landmarks.observed(frame)
         landmark, first = np.unique(landmark, return_index=True)
         places = places[first]
         if self.settings.reprojected:
@@ -89,115 +87,54 @@ class LabeledFrames:
         if self.settings.unseen:
             others, projected = self._unseen(frame, landmark)
             landmark, places = np.concatenate([landmark, others]), np.concatenate([places, projected])
-        order = np.argsort(self._mean_error[landmark], kind="stable")
-        stability = self._stability[landmark[order]]
+        order = np.argsort(landmarks.mean_error[landmark], kind="stable")
+        stability = landmarks.stability[landmark[order]]
         return FramePoints(self._to_picture(places[order]), landmark[order], stability, order < observed)
 
-    def taught_stability(self) -> tuple[int, int]:
-        """How many observations of stable, and of unstable points there are."""
-        codes = self._stability[self._landmark]
-        return int((codes == STABLE).sum()), int((codes == UNSTABLE).sum())
-
-    def _index_observations(self) -> None:
-        """Observations sorted by frame, and the landmark that each of them is of."""
-        table, points = self.sequence.tracks, self.sequence.points
-        order = np.argsort(table.frame, kind="stable")
-        self._start = np.searchsorted(table.frame[order], np.arange(len(self) + 1))
-        self._keypoints: Float32 = table.keypoints[order]
-        track_of_row = rows_of(points.track, table.track)
-        track = track_of_row[order]
-        landmark_of_track, stability = self._landmarks_of_tracks()
-        unsure = medians(track_of_row, table.error, len(points)) < self.settings.unstable_median_error
-        if self.settings.unstable_largest_step < 1:
-            unsure |= ~(largest_step_shares(self.sequence) <= self.settings.unstable_largest_step)
-        stability = np.where((stability == UNSTABLE) & unsure, IGNORE, stability).astype(np.int8)
-        _, representative, landmark_of_track = np.unique(landmark_of_track, return_index=True, return_inverse=True)
-        self._landmark: Int64 = landmark_of_track[track]
-        self._stability: Codes = stability[representative]
-        self._xyz, self._segment = points.xyz[representative], points.segment[representative]
-        self._mean_error = np.nan_to_num(points.mean_error[representative].astype(np.float64), nan=np.inf)
-
-    def _landmarks_of_tracks(self) -> tuple[Int64, Codes]:
-        """The landmark (T,) and its stability (T,) for every track.
-
-        Tracks of one map point are one landmark if the stability rule, applied to all of their observations together,
-        says stable. Short tracks, which have no label alone, then teach too. Other tracks are landmarks of their own.
-        """
-        points, rule = self.sequence.points, self.sequence.rule
-        alone = -1 - np.arange(len(points))
-        if not self.settings.shared:
-            return alone, points.stability
-        owned = np.flatnonzero(
-            (points.point >= 0) & (points.segment >= 0) & ~points.withheld & (points.stability != UNSTABLE)
-            & (points.max_error < rule.unstable_max_error)
-        )  # fmt: skip
-        key = points.point[owned] * (points.segment.max(initial=0) + 1) + points.segment[owned]
-        _, group = np.unique(key, return_inverse=True)
-        observations = np.bincount(group, points.observations[owned])
-        mean_error = np.bincount(group, points.observations[owned] * points.mean_error[owned]) / np.maximum(
-            observations, 1
-        )
-        stable = (observations >= rule.min_observations) & (mean_error <= rule.stable_mean_error)
-        landmark, stability = alone, points.stability.copy()
-        joined = owned[stable[group]]
-        landmark[joined], stability[joined] = key[stable[group]], STABLE
-        return landmark, stability
-
-    def _viewpoints(self) -> tuple[Float64, Float64]:
-        """Mean unit direction (L, 3) from each landmark to the cameras that saw it, and mean distance (L,)."""
-        frame = np.repeat(np.arange(len(self)), np.diff(self._start))
-        known = (self.sequence.frames.segment[frame] == self._segment[self._landmark]) & (
-            self._segment[self._landmark] >= 0
-        )
-        frame, landmark = frame[known], self._landmark[known]
-        rotation, translation = self._poses[:, :3, :3], self._poses[:, :3, 3]
-        centres = -np.einsum("fji,fj->fi", rotation, translation)
-        rays = centres[frame] - self._xyz[landmark]
-        distance = np.linalg.norm(rays, axis=1)
-        count = np.maximum(np.bincount(landmark, minlength=len(self._xyz)), 1)
-        unit = rays / np.maximum(distance, 1e-12)[:, None]
-        total: Float64 = np.stack([np.bincount(landmark, unit[:, axis], len(count)) for axis in range(3)], axis=1)
-        direction: Float64 = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
-        return direction, np.bincount(landmark, distance, len(count)) / count
+    def _usable(self, frame: int) -> bool:
+        return bool(self.landmarks.trusted[frame] and self.landmarks.frame_segment[frame] >= 0)
 
     def _project(self, frame: int, landmark: Int64) -> tuple[Float64, Float64]:
         """Pixels of the recording (N, 2) and depths (N,); NaN pixels behind the camera."""
-        camera_points = transform(self._poses[frame], self._xyz[landmark])
+        camera_points = transform(self.landmarks.cam_from_world[frame], self.landmarks.xyz[landmark])
         depth = camera_points[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            pixels = self.sequence.camera.project(camera_points)
+            pixels = self.landmarks.camera.project(camera_points)
         return np.where(depth[:, None] > 0, pixels, np.nan), depth
 
     def _at_projection(self, frame: int, landmark: Int64, places: Float64) -> Float64:
         """Stable points at the projections of their 3D points, which are the means of all observations."""
-        if not self._usable[frame]:
+        if not self._usable(frame):
             return places
-        moved = (self._stability[landmark] == STABLE) & (self._segment[landmark] == self.sequence.frames.segment[frame])
+        landmarks = self.landmarks
+        moved = landmarks.stability[landmark] == STABLE
+        moved &= landmarks.segment[landmark] == landmarks.frame_segment[frame]
         projected, _ = self._project(frame, landmark)
         near = np.linalg.norm(projected - places, axis=1) <= self.settings.largest_correction
         return np.where((moved & near)[:, None], projected, places)
 
     def _unseen(self, frame: int, observed: Int64) -> tuple[Int64, Float64]:
         """Stable landmarks that no track saw in the frame but that are visible in it, and their pixels."""
-        settings, camera = self.settings, self.sequence.camera
+        settings, landmarks = self.settings, self.landmarks
+        camera = landmarks.camera
         nothing = np.zeros(0, np.int64), np.zeros((0, 2))
-        if not self._usable[frame]:
+        if not self._usable(frame):
             return nothing
-        here = (self._stability == STABLE) & (self._segment == self.sequence.frames.segment[frame])
+        here = (landmarks.stability == STABLE) & (landmarks.segment == landmarks.frame_segment[frame])
         in_frame = np.zeros(len(here), np.bool_)
         in_frame[observed] = True
-        rows = np.flatnonzero(here & ~in_frame & np.isfinite(self._xyz).all(axis=1))
+        rows = np.flatnonzero(here & ~in_frame & np.isfinite(landmarks.xyz).all(axis=1))
         seen = observed[here[observed]]
         if not len(rows) or not len(seen):
             return nothing
         pixels, depth = self._project(frame, rows)
         with np.errstate(invalid="ignore"):
             inside = ((pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1])).all(axis=1)
-        rotation, translation = self._poses[frame, :3, :3], self._poses[frame, :3, 3]
-        rays = -rotation.T @ translation - self._xyz[rows]
+        rotation, translation = landmarks.cam_from_world[frame, :3, :3], landmarks.cam_from_world[frame, :3, 3]
+        rays = -rotation.T @ translation - landmarks.xyz[rows]
         distance = np.linalg.norm(rays, axis=1)
-        cosine = np.einsum("ni,ni->n", rays, self._mean_direction[rows]) / np.maximum(distance, 1e-12)
-        ratio = distance / np.maximum(self._mean_distance[rows], 1e-12)
+        cosine = np.einsum("ni,ni->n", rays, landmarks.mean_direction[rows]) / np.maximum(distance, 1e-12)
+        ratio = distance / np.maximum(landmarks.mean_distance[rows], 1e-12)
         seen_alike = cosine >= np.cos(np.radians(settings.largest_view_angle_degrees))
         seen_alike &= (ratio <= settings.largest_distance_ratio) & (ratio >= 1 / settings.largest_distance_ratio)
         kept = np.flatnonzero(inside & seen_alike)

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from improvo.training.device_pairs import DevicePairs
-from improvo.training.settings import HeldSettings, OdometryTrainingSettings, PairSettings
+from improvo.training.held_settings import HeldSettings
+from improvo.training.settings import OdometryTrainingSettings, PairSettings
 from improvo.training.tracked_pairs import TrackedPairs
 
 

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from improvo.types import Float32, Float64, Int64, UInt8
+from improvo.types import Float32, Float64, Int64, Mask, UInt8
 
 _REDUCED_ABOVE = 1.5  # pixels of the picture per pixel of the view from which on the halved picture is looked at
 
@@ -58,6 +58,38 @@ class PictureStore:
         upper, lower = torch.lerp(grey[0], grey[1], right), torch.lerp(grey[2], grey[3], right)
         return torch.lerp(upper, lower, down)[:, None]
 
+    def grey(self, rows: Int64, points: Tensor, level: int) -> Tensor:
+        """(P, ...) bilinear grey levels at pixels (P, ..., 2) of a level of the pictures; those of the edge outside.
+
+        Args:
+            rows: (P,) numbers of pictures.
+            level: 0 the pictures, 1 the halved ones.
+        """
+        rows = rows + level * self.count
+        shape = (-1, *(1,) * (points.ndim - 2))
+        start = on_device(self.starts[rows], points.device).view(shape)
+        size = on_device(self.sizes[rows], points.device)
+        (x0, x1, right), (y0, y1, down) = (
+            _neighbours(torch.minimum(points[..., axis].clamp(min=0), last), last.long() + 1)
+            for axis, last in enumerate((size - 1.0).T.reshape(2, *shape))
+        )
+        width = size[:, 0].view(shape)
+        above, below = start + y0 * width, start + y1 * width
+        corners = [self.pixels[place].float() for place in (above + x0, above + x1, below + x0, below + x1)]
+        return torch.lerp(torch.lerp(corners[0], corners[1], right), torch.lerp(corners[2], corners[3], right), down)
+
+    def on_level(self, rows: Int64, points: Tensor, level: int) -> Tensor:
+        """Pixels (P, N, 2) of the pictures as pixels of a level."""
+        return (points + 0.5) * self._ratio(rows, level, points) - 0.5
+
+    def off_level(self, rows: Int64, points: Tensor, level: int) -> Tensor:
+        """Pixels (P, N, 2) of a level as pixels of the pictures."""
+        return (points + 0.5) / self._ratio(rows, level, points) - 0.5
+
+    def _ratio(self, rows: Int64, level: int, points: Tensor) -> Tensor:
+        """(P, 1, 2) pixels of a level per pixel of the picture."""
+        return on_device(self.sizes[rows + level * self.count] / self.sizes[rows], points.device)[:, None]
+
     def _suited_level(self, rows: Int64, picture_from_view: Float64, width: int, height: int) -> tuple[Int64, Float64]:
         """Rows of halved pictures where the view looks from afar, and their homographies."""
         middle = np.array([(width - 1) / 2, (height - 1) / 2, 1.0])
@@ -76,6 +108,28 @@ class PictureStore:
         device = self.pixels.device
         start = on_device(self.starts[rows], device)[:, None, None]
         return start, on_device(self.sizes[rows], device)[..., None]
+
+
+class MaskStore:
+    """Which places of pictures are used, on a device; masks are kept at a quarter of their size.
+
+    Args:
+        masks: (H, W) each, which pixels are used; None where all are.
+        sizes: (N, 2) width, height of the pictures.
+    """
+
+    def __init__(self, masks: Sequence[Mask | None], sizes: Int64, device: torch.device) -> None:
+        everywhere = np.ones((2, 2), np.float32)
+        maps = [everywhere if mask is None else _quartered(mask) for mask in masks]
+        scales = [(w / m.shape[1], h / m.shape[0]) for (w, h), m in zip(sizes.tolist(), maps, strict=True)]
+        self._maps = DepthStore(maps, np.array(scales).reshape(-1, 2), device)
+
+    def used(self, rows: Int64, points: Tensor) -> Tensor:
+        """(V, N) bool, whether places (V, N, 2) of pictures lie on used pixels alone; places near the edge do too."""
+        size = on_device(self._maps.sizes[rows] - 1, points.device)[:, None]
+        scale = on_device(self._maps.scales[rows], points.device)[:, None]
+        middles = torch.minimum(((points + 0.5) / scale - 0.5).clamp(min=0), size.float())
+        return self._maps.sample(rows, (middles + 0.5) * scale - 0.5) > 0
 
 
 class DepthStore:
@@ -119,6 +173,12 @@ def on_device(values: NDArray[Any], device: torch.device) -> Tensor:
     """A small array as float32, or int64 where it holds whole numbers, without waiting for what the device does."""
     kind = np.int64 if np.issubdtype(values.dtype, np.integer) else np.float32
     return torch.from_numpy(np.ascontiguousarray(values, kind)).to(device, non_blocking=True)
+
+
+def _quartered(mask: Mask) -> Float32:
+    height, width = mask.shape
+    small = cv2.resize(mask.astype(np.uint8) * 255, (-(-width // 4), -(-height // 4)), interpolation=cv2.INTER_AREA)
+    return (small == 255).astype(np.float32)
 
 
 def _starts(sizes: Int64) -> Int64:

@@ -15,7 +15,7 @@ from improvo.geometry.camera_files import folder_calibration
 from improvo.geometry.trajectory_files import read_trajectory
 from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.images import read_grey
-from improvo.types import Float64, UInt8
+from improvo.types import Float64, Mask, UInt8
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
 
@@ -31,6 +31,7 @@ class Source:
     # (N, 3, 3) K·R_cam_from_world per picture where the camera only turned, so that homographies between pictures are
     # exact; None where that is not known
     rotating: Float64 | None = None
+    masks: tuple[Mask, ...] = ()  # (H, W) each, which pixels are used; empty for all of all pictures
 
     def homography(self, a: int, b: int) -> Float64:
         """(3, 3) from pixels of picture a to pixels of picture b of a camera that only turns."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from improvo.training.settings import DevicePairSettings
-from improvo.types import Float32, Float64, Int64, UInt8
+from improvo.training.held_settings import DevicePairSettings
+from improvo.types import Float32, Float64, Int64, Mask, UInt8
 
 _GRID = (16, 12)  # points along x and y on which overlap is measured
 _COARSE_TOLERANCE = 0.1  # of depths between grid points, relative
@@ -25,6 +25,8 @@ class PosedSequence:
     K: Float64  # (3, 3) of the pictures
     world_from_cam: Float64  # (N, 4, 4)
     inverse_depth: tuple[Float32, ...]  # (h, w) each, a grid over the picture; 0 where nothing is known
+    weight: float = 1.0  # how often it is drawn from, relative to the others
+    masks: tuple[Mask, ...] = ()  # (H, W) each, which pixels are used; empty for all of all pictures
 
     @property
     def size(self) -> tuple[int, int]:

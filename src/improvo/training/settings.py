@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from improvo.errors import ConfigError
 from improvo.frontend.architecture import ARCHITECTURES, CELL
 from improvo.training.setting_checks import Checks
 
@@ -241,6 +240,7 @@ class OdometryTrainingSettings:
     """`improvo train odometry`: VO adaptation, from label stores (paper, "Training Details")."""
 
     longer_side: int = 320  # pixels; larger frames are reduced on loading
+    memory_mib: int = 64  # of labelled sequences that are kept open, in each process that prepares batches
     detector_weight: float = 0.3
     descriptor_weight: float = 1.0
     stability_weight: float = 1.0
@@ -262,63 +262,7 @@ class OdometryTrainingSettings:
         checks = Checks(self)
         checks.choice("descriptor_loss", DESCRIPTOR_LOSSES)
         checks.at_least(0, "detector_weight", "descriptor_weight", "stability_weight", "masked_pixels")
+        checks.at_least(1, "memory_mib")
         checks.at_least(2 * CELL, "longer_side")
         good = not self.negatives_across or self.descriptor_loss == INFO_NCE
         checks.that("negatives_across", good, f"needs `descriptor_loss={INFO_NCE}`")
-
-
-@dataclass(frozen=True)
-class DevicePairSettings:
-    """Which pairs are made on the device, and what is taught about them."""
-
-    posed_share: float = 0.5  # of the pairs are of frames of posed sequences, where such are given
-    two_frames: bool = True  # those show two frames, related by depth and poses; False: one frame twice, the control
-    largest_gap: float = 3.0  # seconds between two frames
-    least_overlap: float = 0.2  # share of either frame that the other shows
-    depth_tolerance: float = 0.03  # of two frames' depths of a point, relative; beyond it something hides the point
-    points: int = 384  # correspondences taught per pair, at most
-    keypoint_share: float = 0.5  # of them are keypoints of the detector that is held, the rest lie anywhere
-    group: int = 4  # so many pairs are each other's wrong partners
-
-    def __post_init__(self) -> None:
-        checks = Checks(self, "pairs")
-        checks.between(0, 1, "posed_share", "keypoint_share", "least_overlap")
-        checks.at_least(2, "points")
-        checks.at_least(1, "group")
-        checks.positive("largest_gap", "depth_tolerance")
-
-
-@dataclass(frozen=True)
-class HeldSettings:
-    """Descriptors trained on, while detector and stability are held to what other weights say of the same views."""
-
-    longer_side: int = 640  # pixels; larger pictures are reduced on loading
-    descriptor_weight: float = 1.0
-    detector_weight: float = 1.0  # of the divergence from the detector of the weights that it starts from
-    stability_weight: float = 1.0  # of the divergence from the stability of the teacher, where one is given
-    stability_every: int = 4  # the teacher looks at every so many views
-    masked_pixels: float = 8.0  # points nearer than this are not each other's negatives
-    compile: bool = False  # let torch fuse the network's operations; needs a C compiler
-    pairs: DevicePairSettings = field(default_factory=DevicePairSettings)
-    optimiser: OptimiserSettings = field(
-        default_factory=lambda: OptimiserSettings(
-            batch_size=64, learning_rate=1e-3, steps=4000, decay_steps=1300, warmup_steps=100, workers=0
-        )
-    )
-    views: ViewSettings = field(
-        default_factory=lambda: ViewSettings(height=240, width=320, smallest_zoom=0.6, rotation_degrees=30.0)
-    )
-    photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
-
-    def __post_init__(self) -> None:
-        checks = Checks(self)
-        checks.at_least(0, "descriptor_weight", "detector_weight", "stability_weight", "masked_pixels")
-        checks.at_least(2 * CELL, "longer_side")
-        checks.at_least(1, "stability_every")
-        if self.optimiser.batch_size % self.pairs.group:
-            raise ConfigError(
-                f"setting `optimiser.batch_size`: {self.optimiser.batch_size} is no multiple of `pairs.group` "
-                f"{self.pairs.group}"
-            )
-        if self.optimiser.workers:
-            raise ConfigError("setting `optimiser.workers`: batches made on the device need 0")

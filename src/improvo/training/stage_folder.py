@@ -19,8 +19,9 @@ from improvo.frontend.architecture import Architecture
 from improvo.frontend.channel_pruning import with_dead_channels
 from improvo.frontend.weights import DataSource, ModelCard, load_weights, save_weights
 from improvo.training.distributed import Process
+from improvo.training.held_settings import HeldSettings
 from improvo.training.metrics import METRICS, read_metrics
-from improvo.training.settings import HeldSettings, HomographiesSettings, OdometryTrainingSettings, ShapesSettings
+from improvo.training.settings import HomographiesSettings, OdometryTrainingSettings, ShapesSettings
 from improvo.training.stage import Stage
 from improvo.training.trainer import Batches, Trainer
 
@@ -148,7 +149,7 @@ def _saved_steps(path: Path) -> int:
 
 def _same_settings(path: Path, settings: StageSettings) -> None:
     """Remember the settings of the folder; refuse to continue it under others."""
-    record = SettingsRecord(path, type(settings), [f"optimiser.{name}" for name in _FREE])
+    record = SettingsRecord(path, type(settings), [*(f"optimiser.{name}" for name in _FREE), "memory_mib"])
     values = config.to_dict(settings)
     record.check(values, "give the same settings or another output folder")
     record.write(values)

@@ -131,7 +131,7 @@ def train_odometry(
             stable points.
     """
     from improvo.labeling.labeled import read_labels
-    from improvo.training.labeled_frames import LabeledFrames
+    from improvo.training.label_library import LabelLibrary
     from improvo.training.tracked_pairs import TrackedPairs
     from improvo.training.vo_adaptation import VOAdaptationStage
 
@@ -141,10 +141,13 @@ def train_odometry(
         parent = load_weights(start)
         architecture = replace(without_dead_channels(parent).architecture, stability=True)
         network = started_network(architecture, settings.optimiser.seed, parent)
-        frames = [LabeledFrames(sequence, settings.longer_side, settings.landmarks) for sequence in sequences]
+        frames = LabelLibrary(
+            sequences, settings.longer_side, settings.landmarks, output, settings.memory_mib,
+            settings.optimiser.workers, progress,
+        )  # fmt: skip
         replay, sources = _replay(pictures, settings, output, progress)
         pairs = TrackedPairs(frames, settings, replay)
-        if not sum(len(useful) for useful in pairs.useful):
+        if not pairs.useful_frames:
             least = settings.pairs.least_points
             raise InputError(
                 f"{labels[0]}: no frame has {least} stable points; label more or livelier video, or lower "

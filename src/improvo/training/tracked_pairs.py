@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from improvo.frontend.masking import unmasked
 from improvo.stability.rule import STABLE, UNSTABLE
+from improvo.training.label_library import LabelLibrary
 from improvo.training.labeled_frames import FramePoints, LabeledFrames, common_points
 from improvo.training.labels import DUSTBIN, IGNORED, label_cells
 from improvo.training.pairs import PairBatches, View
@@ -53,7 +54,7 @@ class TrackedPairs(SeededBatches):
     0 unstable, IGNORED.
 
     Args:
-        sequences: labeled video.
+        sequences: labeled video, in memory or opened when drawn.
         settings: of the stage.
         replay: homography pairs of other pictures, which keep the network general; `pairs.replay_share` of all.
     """
@@ -66,11 +67,17 @@ class TrackedPairs(SeededBatches):
     ) -> None:
         super().__init__(settings)
         self.sequences, self.settings, self.replay = sequences, settings, replay
-        self.useful = [frames.useful_frames(max(settings.pairs.least_points, 1)) for frames in sequences]
+        if isinstance(sequences, LabelLibrary):
+            self._summaries = sequences.summaries
+        else:
+            self._summaries = [frames.summary() for frames in sequences]
+        self._least = max(settings.pairs.least_points, 1)
+        useful = [len(summary.useful_frames(self._least)) for summary in self._summaries]
+        self.useful_frames = sum(useful)
         # as with pictures: long recordings leave room for short ones
-        self._cumulative = np.cumsum(np.sqrt([len(useful) for useful in self.useful]))
-        taught = np.array([frames.taught_stability() for frames in sequences]).sum(axis=0)
-        self.stable_per_unstable = float(taught[0] / max(taught[1], 1))
+        self._cumulative = np.cumsum(np.sqrt(useful))
+        stable, unstable = (sum(getattr(s, kind) for s in self._summaries) for kind in ("stable", "unstable"))
+        self.stable_per_unstable = float(stable / max(unstable, 1))
 
     def __getitem__(self, step: int) -> Batch:
         seed = self.settings.optimiser.seed
@@ -94,7 +101,7 @@ class TrackedPairs(SeededBatches):
             return _unlabeled(first), _unlabeled(second), Correspondences(points_a, points_b, valid, valid)
         chosen = int(np.searchsorted(self._cumulative, rng.uniform(0, self._cumulative[-1]), side="right"))
         frames = self.sequences[chosen]
-        frame_a = int(rng.choice(self.useful[chosen]))
+        frame_a = int(rng.choice(self._summaries[chosen].useful_frames(self._least)))
         a = frames.points(frame_a)
         frame_b, b = self._partner(rng, frames, frame_a, a)
         rows_a, rows_b = common_points(a, b)

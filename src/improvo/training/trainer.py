@@ -24,9 +24,11 @@ from torch.utils.data import DataLoader
 
 from improvo import files, terminal
 from improvo.errors import ConfigError, ImprovoError, InputError
+from improvo.formats import FORMAT, FORMAT_KEY, check_format
 from improvo.training.distributed import Process
 from improvo.training.metrics import METRICS, append_metrics, keep_metrics
 from improvo.training.settings import OptimiserSettings
+from improvo.training.shared_statistics import share_batch_norm
 from improvo.training.stage import Stage
 
 CHECKPOINT = "checkpoint.pt"
@@ -87,6 +89,7 @@ class Trainer:
         self.device = choose_device(settings.device)
         self.precision = choose_precision(settings.precision, self.device)
         self.stage = stage.to(self.device, memory_format=torch.channels_last)
+        share_batch_norm(self.stage)
         self.average = deepcopy(self.stage).requires_grad_(False)
         self.batches, self.settings, self.folder, self.allowed = batches, settings, folder, seconds
         self._averaged = [
@@ -121,12 +124,15 @@ class Trainer:
             return False
         try:
             state = torch.load(path, map_location=self.device, weights_only=True)
+            check_format(state.get(FORMAT_KEY), path, "choose a new output folder")
             self.stage.load_state_dict(state["stage"])
             self.average.load_state_dict(state["average"])
             self.optimiser.load_state_dict(state["optimiser"])
             self.step, self.seconds = int(state["step"]), float(state["seconds"])
             if self.allowed:
                 self.settings = replace(self.settings, **state["planned"])
+        except ImprovoError:
+            raise
         except Exception as error:  # torch raises many kinds; none of them is worth a traceback
             reason = str(error).splitlines()[0]
             raise InputError(f"{path}: cannot be continued from ({reason}); choose a new output folder") from None
@@ -137,6 +143,7 @@ class Trainer:
     def save(self) -> None:
         """Write the checkpoint atomically."""
         state = {
+            FORMAT_KEY: FORMAT,
             "stage": self.stage.state_dict(),
             "average": self.average.state_dict(),
             "optimiser": self.optimiser.state_dict(),

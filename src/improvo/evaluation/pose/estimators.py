@@ -1,6 +1,6 @@
-"""Pose from 3D-to-2D matches: the paper's solver and a robust one.
+"""Pose from 3D-to-2D matches: the paper's solver, and robust ones.
 
-Which of the two is used moves Table 1 more than which frontend is: OpenCV's default stops after 100 RANSAC
+Whether the solver is robust moves Table 1 more than which frontend is: OpenCV's default stops after 100 RANSAC
 iterations, which at 15 % inliers almost never succeeds. A claim about a frontend names the solver.
 """
 
@@ -12,7 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from improvo.errors import ConfigError
 from improvo.geometry.camera import Camera
+from improvo.geometry.ransac import Ransac, poselib_installed, robust_solver
 from improvo.geometry.se3 import rigid, so3_exp
 from improvo.types import Float64
 
@@ -63,15 +65,33 @@ def with_poselib(points: Float64, pixels: Float64, camera: Camera, seed: int) ->
     """PoseLib's LO-RANSAC (P3P, local optimisation) with the same inlier threshold and enough iterations.
 
     Args and returns as `with_opencv`; `seed` is that of its sampling.
-    """
-    from improvo.geometry.two_view import Ransac, absolute_pose
 
+    Raises:
+        ConfigError: PoseLib is not installed.
+    """
+    if not poselib_installed():
+        raise ConfigError("estimator poselib: PoseLib is not installed here; pip install poselib, or choose usac")
+    return _robust(points, pixels, camera, seed, "poselib")
+
+
+def with_usac(points: Float64, pixels: Float64, camera: Camera, seed: int) -> PoseEstimate | None:
+    """OpenCV's USAC, what the odometry uses where PoseLib is not installed; as `with_poselib`."""
+    return _robust(points, pixels, camera, seed, "opencv")
+
+
+def with_robust_solver(points: Float64, pixels: Float64, camera: Camera, seed: int) -> PoseEstimate | None:
+    """The robust solver that the odometry uses here: PoseLib where it is installed, else OpenCV's USAC."""
+    return _robust(points, pixels, camera, seed, "")
+
+
+def _robust(points: Float64, pixels: Float64, camera: Camera, seed: int, solver: str) -> PoseEstimate | None:
     if len(points) < 4:
         return None
-    found = absolute_pose(points, pixels, camera, Ransac(REPROJECTION_ERROR, seed, max_iterations=10_000))
+    ransac = Ransac(REPROJECTION_ERROR, seed, max_iterations=10_000)
+    found = robust_solver(solver).absolute_pose(points, pixels, camera, ransac)
     if not np.isfinite(found.pose).all() or found.inliers.sum() < 4:
         return None
     return PoseEstimate(found.pose, found.inliers)
 
 
-ESTIMATORS: dict[str, Estimator] = {"opencv": with_opencv, "poselib": with_poselib}
+ESTIMATORS: dict[str, Estimator] = {"opencv": with_opencv, "poselib": with_poselib, "usac": with_usac}

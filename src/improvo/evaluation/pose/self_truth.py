@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from improvo.errors import ConfigError, InputError
 from improvo.evaluation.measures import PairGeometry, relative_motion
-from improvo.evaluation.pose.estimators import ESTIMATORS
 from improvo.evaluation.pose.protocol import Records, evaluate_pair
 from improvo.evaluation.pose.results import share
-from improvo.evaluation.settings import PoseSettings
+from improvo.evaluation.settings import DEFAULT_ESTIMATORS, PoseSettings
 from improvo.evaluation.statistics import Bootstrap, below
 from improvo.geometry.camera import Camera
 from improvo.types import Features, Float32, Float64, Int64
@@ -34,7 +33,7 @@ class SelfTruthSettings:
     max_keypoints: int = 500
     right_px: tuple[float, float] = (3.0, 8.0)  # a match is right strictly below
     shuffles: int = 8  # orders of the matches that the solvers get
-    estimators: tuple[str, ...] = tuple(ESTIMATORS)
+    estimators: tuple[str, ...] = DEFAULT_ESTIMATORS
     max_rotation_deg: float = 5.0  # success is strictly below
     max_translation: float = 0.025  # in median depths of A: 5 cm at 2 m; success is strictly below
     min_matches: int = 4  # with depth in A; a pair of frames with fewer counts as none right

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from improvo.evaluation.tables import bold_best, columns_to_rows, decimals, markdown
+from improvo.terminal import counted
 
 
 def pose_tables(results: dict[str, Any], sequences: bool = False) -> str:
@@ -18,10 +19,15 @@ def pose_tables(results: dict[str, Any], sequences: bool = False) -> str:
     parts = [_setup(results)]
     for estimator in settings["estimators"]:
         parts += [f"### Pose estimation, solver {estimator}", _table_1(results, results["rows"], estimator)]
-        parts += [
-            f"{100 * settings['confidence']:.0f} % bootstrap intervals of the same cells:",
-            _intervals(results, estimator),
-        ]
+        parts.append(
+            f"{100 * settings['confidence']:.0f} % bootstrap intervals of the same cells, and of both at once:"
+        )
+        parts.append(_intervals(results, estimator, _SUCCESSES))
+    shares = _right_shares(results)
+    if shares:
+        parts += ["### Right matches, less noisy than success", _shares_table(results, results["rows"])]
+        names = {field: f"< {limit:g} px" for field, limit in shares.items()}
+        parts.append(_intervals(results, settings["estimators"][0], names))
     if results.get("differences"):
         first = results["frontends"][0]
         parts.append(f"### Differences to {first}, on the same pairs (bold where the interval leaves out zero)")
@@ -34,6 +40,7 @@ def pose_tables(results: dict[str, Any], sequences: bool = False) -> str:
             rows = [row for row in results["sequence_rows"] if row["sequence"] == sequence["name"]]
             for estimator in settings["estimators"]:
                 parts += [f"### {sequence['name']}, solver {estimator}", _table_1(results, rows, estimator)]
+            parts += [_shares_table(results, rows)] if shares else []
     return "\n\n".join(parts) + "\n"
 
 
@@ -50,7 +57,7 @@ def _setup(results: dict[str, Any]) -> str:
             if sequence[kind]:
                 named = ", ".join(map(str, sequence[f"first_{kind}"]))
                 more = ", …" if sequence[kind] > len(sequence[f"first_{kind}"]) else ""
-                line += f"; left out {sequence[kind]} frames {what} ({named}{more})"
+                line += f"; left out {counted(sequence[kind], 'frame')} {what} ({named}{more})"
         lines.append(line)
     lines += [f"- frontend {s['frontend']} not run: {s['reason']}" for s in results.get("skipped_frontends", ())]
     rules = [
@@ -71,21 +78,18 @@ def _cell(rows: list[dict[str, Any]], frontend: str, estimator: str, gap: int, f
 
 
 def _table_1(results: dict[str, Any], rows: list[dict[str, Any]], estimator: str) -> str:
-    """The paper's Table 1, for one solver, and the shares of right matches, which are less noisy."""
+    """The paper's Table 1, for one solver."""
     settings, frontends = results["settings"], results["frontends"]
     gaps = settings["gaps"]
     pose = {entry["gap"]: entry for entry in results["gaps"]}
-    shares = _right_shares(results)
-    header = ["Frame difference", *(str(gap) for _ in range(2 + len(shares)) for gap in gaps)]
+    header = ["Frame difference", *(str(gap) for _ in range(2) for gap in gaps)]
     average = ["Average relative pose", *(f"{pose[gap]['mean_rotation_deg']:.0f}°" for gap in gaps)]
     average += [f"{100 * pose[gap]['mean_translation_m']:.0f} cm" for gap in gaps]
-    average += [""] * (len(shares) * len(gaps))
     rotation = f"Rot. < {settings['max_rotation_deg']:g}°"
     translation = f"Transl. < {100 * settings['max_translation_m']:g} cm"
-    names = [rotation, translation, *(f"Right < {limit:g} px" for limit in shares.values())]
-    legend = ["", *(name for name in names for _ in gaps)]
+    legend = ["", *(name for name in (rotation, translation) for _ in gaps)]
     columns = []
-    for field in ("rotation_success", "translation_success", *shares):
+    for field in ("rotation_success", "translation_success"):
         for gap in gaps:
             values = [_cell(rows, frontend, estimator, gap, field) for frontend in frontends]
             columns.append(bold_best([decimals(value) for value in values], values))
@@ -93,16 +97,31 @@ def _table_1(results: dict[str, Any], rows: list[dict[str, Any]], estimator: str
     return markdown(header, [*shown, *columns_to_rows(frontends, columns)])
 
 
+def _shares_table(results: dict[str, Any], rows: list[dict[str, Any]]) -> str:
+    """Shares of right matches; they are the same for every solver."""
+    settings, frontends, shares = results["settings"], results["frontends"], _right_shares(results)
+    gaps, solver = settings["gaps"], settings["estimators"][0]
+    header = ["Frame difference", *(str(gap) for _ in shares for gap in gaps)]
+    legend = ["", *(f"Right < {limit:g} px" for limit in shares.values() for _ in gaps)]
+    columns = []
+    for field in shares:
+        for gap in gaps:
+            values = [_cell(rows, frontend, solver, gap, field) for frontend in frontends]
+            columns.append(bold_best([decimals(value) for value in values], values))
+    return markdown(header, [legend, *columns_to_rows(frontends, columns)])
+
+
 def _right_shares(results: dict[str, Any]) -> dict[str, float]:
     """Names of the shares of right matches and their limits in pixels; none in results of earlier versions."""
     return {f"right_share_{limit:g}px": limit for limit in results["settings"].get("right_px", ())}
 
 
-def _intervals(results: dict[str, Any], estimator: str) -> str:
+_SUCCESSES = {"rotation_success": "rot.", "translation_success": "transl.", "pose_success": "both"}
+
+
+def _intervals(results: dict[str, Any], estimator: str, fields: dict[str, str]) -> str:
     gaps, frontends = results["settings"]["gaps"], results["frontends"]
     header, columns = [""], []
-    fields = {"rotation_success": "rot.", "translation_success": "transl.", "pose_success": "both"}
-    fields |= {field: f"< {limit:g} px" for field, limit in _right_shares(results).items()}
     for field, name in fields.items():
         for gap in gaps:
             header.append(f"{name} {gap}")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from improvo.evaluation.pose.estimators import with_poselib
+from improvo.evaluation.pose.estimators import with_robust_solver
 from improvo.evaluation.truth.structure_from_motion import ReconstructedImage
 from improvo.geometry.camera import Camera
 from improvo.geometry.depth_sampling import depth_at
@@ -75,7 +75,7 @@ def check_motion(
                 continue
             lifted = pinhole.unproject(undistorted(first.pixels[rows_a][known], camera), z[known])
             pixels = undistorted(second.pixels[rows_b][known], camera)
-            found = with_poselib(lifted, pixels, pinhole, seed)
+            found = with_robust_solver(lifted, pixels, pinhole, seed)
             if found is None:
                 continue
             own, by_depth = (inverse(motion)[:3, 3] for motion in (true, found.cam_from_world))

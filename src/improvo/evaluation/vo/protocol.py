@@ -70,14 +70,14 @@ def run_vo(task: VoTask) -> list[VoOutcome]:
     outcomes = []
     for variant in (WITHOUT, WITH) if has_head else ("",):
         odometry = VisualOdometry(frontend, sequence.camera, task.odometry, use_stability=variant == WITH)
-        _track(odometry, detected)
+        _track(odometry, detected, sequence)
         outcomes.append(_outcome(sequence, task, variant, len(detected), odometry.trajectory))
     return outcomes
 
 
-def _track(odometry: VisualOdometry, detected: list[tuple[float, Features]]) -> None:
-    for time, features in detected:
-        odometry.track_features(features, time)
+def _track(odometry: VisualOdometry, detected: list[tuple[float, Features]], sequence: Sequence) -> None:
+    for (time, features), frame in zip(detected, sequence, strict=True):
+        odometry.track_features(features, time, frame.image)
     odometry.finish()
 
 

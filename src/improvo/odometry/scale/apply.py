@@ -68,10 +68,7 @@ def apply_scale(sequence: Sequence, run: Run, ask: Ask, settings: ScaleSettings)
         writer.write(points)
     write_trajectory(run.folder / "trajectory.txt", trajectory, unit=unit)
     write_json(run.folder / "run.json", report)
-    changed: dict[str, Any] = {"trajectory": trajectory, "report": report}
-    if hasattr(run, "points"):
-        changed["points"] = points
-    return replace(run, **changed)
+    return replace(run, trajectory=trajectory, report=report)
 
 
 def segment_maps(trajectory: Trajectory, estimates: dict[int, ScaleEstimate]) -> dict[int, SegmentMap]:

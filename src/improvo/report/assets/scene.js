@@ -72,7 +72,7 @@
   function drawPath(project, scale) {
     context.lineCap = "round";
     const lastOnes = count - 1 - data.last;
-    for (const [wide, colourOf] of [[5, (i) => (i > lastOnes ? "#fff" : null)], [3, (i) =>
+    for (const [wide, colourOf] of [[9, (i) => (data.doubted[i] ? "#ff4fd8" : null)], [5, (i) => (i > lastOnes ? "#fff" : null)], [3, (i) =>
       (i > lastOnes ? "#000" : ramp(data.frame_indices[i] / Math.max(1, data.frames - 1)))]]) {
       for (let i = 1; i < count; i++) {
         const colour = colourOf(i);

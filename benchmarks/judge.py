@@ -1,0 +1,225 @@
+"""Whether the judge of `improvo improve` orders weights as the truth does.
+
+    python benchmarks/judge.py OUT... --former OLD.safetensors --frontend NAME=FILE ...   # about 10 s a candidate
+    python benchmarks/judge.py OUT... --only --frontend before=superpoint-small --frontend after=FILE
+
+`OUT` are folders of `improvo improve`: each has a reference run with depth, and what was held back. For every candidate
+the share of right matches (3 and 8 px) of the frames held back, by the reference, and by true poses and depth where the
+recording has them; then, for each recording and gap, the rank correlation (Spearman) of the two over the candidates.
+Candidates are the bundled weights, those given, and, without `--only`, sums and spoiled ones of `superpoint-small`.
+With `--only` it compares: every row with the first, with 95 % intervals (bootstrap over pairs).
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import json
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.stats import spearmanr
+
+from improvo.evaluation.measures import PairGeometry, relative_motion, right_matches
+from improvo.evaluation.pose.self_truth import FixedRun, choose_pairs
+from improvo.evaluation.statistics import Bootstrap
+from improvo.frontend.registry import load_frontend
+from improvo.frontend.weights import find_weights, load_weights
+from improvo.improvement.gaps import choose_gaps
+from improvo.improvement.reference import HELD_BACK, ReferencePart, reference_parts
+from improvo.improvement.rounds import calibration_images, write_calibrated
+from improvo.improvement.settings import ValidationSettings
+from improvo.improvement.split import read_split
+from improvo.sequences import open_sequence
+from improvo.tracking.matching import mutual_nearest_neighbours
+from improvo.types import Features, Int64
+from judge_candidates import written
+
+LIMITS = (3.0, 8.0)
+KEYPOINTS = 500
+Shares = dict[str, list[list[float]]]  # "judge 90" -> of each pair, the share within each limit
+
+
+@dataclass(frozen=True)
+class Set:
+    """The pairs of one recording by which weights are compared."""
+
+    name: str
+    part: ReferencePart
+    pairs: dict[str, Int64]  # "judge 90", "truth 90" -> (K, 2)
+    geometry: Callable[[str, int, int], PairGeometry]
+
+
+def opened(folder: Path, gaps: tuple[int, ...], most: int) -> list[Set]:
+    """The recordings held back in a folder of `improve`."""
+    if not (folder / "split.json").is_file():
+        raise SystemExit(f"{folder}: is no folder of `improvo improve`")
+    split = read_split(folder / "split.json")
+    return [
+        _set(part, folder, gaps, most) for part in reference_parts(folder / "reference", split.held_back, HELD_BACK)
+    ]
+
+
+def _set(part: ReferencePart, folder: Path, gaps: tuple[int, ...], most: int) -> Set:
+    run, settings = part.fixed_run(), ValidationSettings()
+    chosen = gaps or choose_gaps(run, settings.overlaps, settings.min_pairs)
+    true = _true_run(part)
+    pairs = {f"judge {gap}": choose_pairs(run, gap, most) for gap in chosen}
+    if true is not None:
+        pairs |= {f"truth {gap}": choose_pairs(true, gap, most) for gap in chosen}
+
+    def geometry(kind: str, a: int, b: int) -> PairGeometry:
+        chosen = true if kind.startswith("truth") and true is not None else run
+        depth = chosen.depth(a)
+        motion = relative_motion(chosen.world_from_cam, np.array([[a, b]]))[0]
+        return PairGeometry(chosen.camera, motion, np.where(depth > 0, depth, np.nan).astype(np.float32), None)
+
+    pairs = {name: found for name, found in pairs.items() if len(found)}
+    return Set(f"{part.name} ({folder.name})", part, pairs, geometry)
+
+
+def calibrated(weights: Path, folder: Path, keep: Path) -> Path:
+    """Weights with activation ranges, which all others have: measured on frames that were trained on where missing."""
+    if load_weights(find_weights(str(weights))).card.activation_ranges:
+        return weights
+    target = keep / f"{'-'.join(weights.with_suffix('').parts[-2:])}.safetensors"
+    if not target.is_file():
+        write_calibrated(weights, target, calibration_images(read_split(folder / "split.json").training, 24))
+    return target
+
+
+def _true_run(part: ReferencePart) -> FixedRun | None:
+    """True poses and depth images of the part's frames; None where the recording has none."""
+    sequence = open_sequence(Path(part.labeled.record.path))
+    if sequence.ground_truth is None:
+        return None
+    poses = np.full((len(sequence), 4, 4), np.nan)
+    rows = part.frames[sequence.ground_truth.valid[part.frames]]
+    poses[rows] = sequence.ground_truth.world_from_cam[rows]
+    has_depth = np.zeros(len(sequence), np.bool_)
+    for row in rows:
+        depth = sequence.depth(int(row))
+        has_depth[row] = depth is not None and bool((depth > 0).any())
+    if not has_depth.any():
+        return None
+    segment = np.where(np.isfinite(poses).all(axis=(1, 2)), 0, -1)
+    return FixedRun(sequence.camera, poses, segment, has_depth, sequence.depth)
+
+
+def shares(chosen: Set, weights: Path) -> Shares:
+    """Shares of right matches of every pair."""
+    frontend = load_frontend(str(weights), KEYPOINTS)
+
+    @cache
+    def features(frame: int) -> Features:
+        return chosen.part.features(frontend, frame)
+
+    return {
+        name: [_right(chosen.geometry(name, a, b), features(a), features(b)) for a, b in pairs.tolist()]
+        for name, pairs in chosen.pairs.items()
+    }
+
+
+def _right(geometry: PairGeometry, a: Features, b: Features) -> list[float]:
+    matches = mutual_nearest_neighbours(a, b, max_distance=None)
+    points = geometry.points_a(a.keypoints[matches[:, 0]])
+    pixels = b.keypoints[matches[:, 1]].astype(np.float64)
+    known = np.isfinite(points[:, 2])
+    if known.sum() < 4:
+        return [0.0 for _ in LIMITS]
+    return [float(right_matches(geometry, points[known], pixels[known], limit).mean()) for limit in LIMITS]
+
+
+def compared(found: dict[str, Shares], limit: int) -> None:
+    """Every candidate against the first, by the judge and by truth: all gaps with the same weight, then each."""
+    first, *others = found
+    for name in others:
+        cells = []
+        for kind in ("judge", "truth"):
+            gaps = [gap for gap in found[first] if gap.startswith(kind)]
+            if gaps:
+                cells.append(
+                    f"{kind} {_gain(found[first], found[name], gaps, limit)}: "
+                    + ", ".join(f"{gap.split()[1]} {_gain(found[first], found[name], [gap], limit)}" for gap in gaps)
+                )
+        print(f"| {name} | {LIMITS[limit]:g} px | " + " | ".join(cells) + " |")
+
+
+def _gain(before: Shares, after: Shares, gaps: list[str], limit: int) -> str:
+    base = np.mean([np.mean([pair[limit] for pair in before[gap]]) for gap in gaps])
+    resampled, differences = [], []
+    for number, gap in enumerate(gaps):
+        difference = np.array(after[gap])[:, limit] - np.array(before[gap])[:, limit]
+        resampled.append(Bootstrap(len(difference), number, 1000, 0.95).means(difference))
+        differences.append(difference.mean())
+    low, high = np.percentile(np.mean(resampled, axis=0), (2.5, 97.5))
+    return f"{100 * np.mean(differences) / base:+.1f} % ({100 * low / base:+.1f} to {100 * high / base:+.1f})"
+
+
+def correlations(found: dict[str, Shares], spoiled: set[str]) -> None:
+    """Rank correlation of judge and truth, over all candidates and over those that are not spoiled."""
+    some = next(iter(found.values()))
+    groups = {"all": list(found), "not spoiled": [name for name in found if name not in spoiled]}
+    for gap in [name.split()[1] for name in some if name.startswith("judge") and f"truth {name.split()[1]}" in some]:
+        for group, names in groups.items():
+            ranks = []
+            for limit in (1, 0):
+                judge, truth = (
+                    [np.array(found[name][f"{kind} {gap}"])[:, limit].mean() for name in names]
+                    for kind in ("judge", "truth")
+                )
+                ranks.append(spearmanr(judge, truth).statistic)
+            print(f"| {gap} | {group} | {len(names)} | {ranks[0]:.3f} | {ranks[1]:.3f} |")
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="+", type=Path)
+    parser.add_argument("--frontend", action="append", default=[], metavar="NAME=FILE")
+    parser.add_argument("--former", type=Path, help="weights of the layers of superpoint-small, to be mixed with it")
+    parser.add_argument("--only", action="store_true", help="compare those given, and nothing else")
+    parser.add_argument("--gaps", nargs="*", type=int, default=[], help="frames (default: by overlap)")
+    parser.add_argument("--pairs", type=int, default=60, help="of a gap, at most")
+    parser.add_argument("--keep", type=Path, help="folder for candidates and shares, used again where they are there")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    given = {name: Path(path) for name, _, path in (entry.partition("=") for entry in arguments.frontend)}
+    with tempfile.TemporaryDirectory() as temporary:
+        keep = arguments.keep or Path(temporary)
+        made = {} if arguments.only else written(keep / "candidates", "superpoint-small", arguments.former)
+        bundled = [] if arguments.only else ["superpoint-small", "superpoint", "superpoint-vo"]
+        former = {"former": arguments.former} if arguments.former else {}
+        candidates = {**{name: Path(name) for name in bundled}, **former, **given, **made}
+        for folder in arguments.folders:
+            for chosen in opened(folder, tuple(arguments.gaps), arguments.pairs):
+                found = {}
+                for name, path in candidates.items():
+                    file = keep / folder.name / f"{name.replace(' ', '-')}.json"
+                    if not file.is_file():
+                        file.parent.mkdir(parents=True, exist_ok=True)
+                        file.write_text(json.dumps(shares(chosen, calibrated(path, folder, file.parent))))
+                    found[name] = json.loads(file.read_text())
+                print(f"\n{chosen.name}: pairs " + ", ".join(f"{name}: {len(p)}" for name, p in chosen.pairs.items()))
+                if arguments.only:
+                    for limit in (1, 0):
+                        compared(found, limit)
+                    continue
+                print("| candidate | " + " | ".join(found[bundled[0]]) + " |")
+                for name, values in found.items():
+                    means = " | ".join(f"{np.array(pairs)[:, 1].mean():.3f}" for pairs in values.values())
+                    print(f"| {name} | {means} |")
+                print("\n| frames apart | candidates | number | rank correlation, 8 px | 3 px |")
+                correlations(found, {name for name in made if not name.startswith("mixed")})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,217 @@
+"""How `benchmarks/robustness.py` judges a run: segment by segment and frame by frame, against the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from improvo.errors import InputError
+from improvo.evaluation.trajectory.protocol import align, clean_truth
+from improvo.geometry.se3 import rotation_angle_deg
+from improvo.odometry.events import Event
+from improvo.odometry.segments import Segment
+from improvo.odometry.settings import OdometrySettings
+from improvo.odometry.states import TrackingState
+from improvo.odometry.visual_odometry import VisualOdometry
+from improvo.types import Features, Float64, Trajectory
+from robustness_clips import Clip
+
+RIGHT_PERCENT = 3.0  # of the segment's own path
+WRONG_PERCENT = 5.0
+RIGHT_ROTATION_DEG = 2.0  # over a second
+MIN_FRAMES = 20  # of a segment, for it to count
+MIN_PATH = 0.02  # metres; without a path, an error has no share of it
+DOUBTS = ("two motions", "focal length")  # events that say that the segment may be wrong
+RIGHT, WRONG, NONE, IMPOSSIBLE, POSE_OF_NOTHING = "R", "w", ".", "x", "X"  # of a frame
+
+
+@dataclass(frozen=True)
+class JudgedSegment:
+    """A segment of a finished run."""
+
+    number: int
+    first: int
+    last: int
+    frames: int
+    path_m: float  # true
+    error_percent: float | None  # ATE after Sim3 over the path; None where there is no path or no truth
+    reason: str
+    doubt: str  # what the run itself says against it; empty where it claims to be right
+
+    @property
+    def counts(self) -> bool:
+        """Whether it is long enough to count."""
+        return self.frames >= MIN_FRAMES
+
+    @property
+    def right(self) -> bool:
+        """Whether its error is small."""
+        return self.error_percent is not None and self.error_percent < RIGHT_PERCENT
+
+    @property
+    def wrong(self) -> bool:
+        """Whether its error is large, or it claims a path where there was none."""
+        return self.error_percent is None or self.error_percent > WRONG_PERCENT
+
+    @property
+    def silent(self) -> bool:
+        """Whether it is wrong and claims to be right."""
+        return self.counts and self.wrong and not self.doubt
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """A segment that the odometry ended, started anew, or doubts."""
+
+    frame: int
+    detail: str
+    error_percent: float | None  # of the segment then
+    false: bool
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Everything about one run."""
+
+    frames: str  # a letter for each: right, wrong, none, impossible, or a pose of nothing
+    segments: list[JudgedSegment]
+    alarms: list[Alarm]
+    events: list[Event]
+
+    @property
+    def outcome(self) -> str:
+        """`right`, `marked`, `lost` or `SILENT`."""
+        if any(segment.silent for segment in self.segments) or self.frames.count(POSE_OF_NOTHING) > 2:
+            return "SILENT"
+        possible = len(self.frames) - self.frames.count(IMPOSSIBLE) - self.frames.count(POSE_OF_NOTHING)
+        if self.frames.count(RIGHT) >= 0.8 * max(possible, 1):
+            return "right"
+        if self.alarms or any(segment.doubt for segment in self.segments):
+            return "marked"
+        return "lost"
+
+    def as_json(self) -> dict[str, Any]:
+        """For a file."""
+        return {
+            "outcome": self.outcome,
+            "frames": self.frames,
+            "segments": [
+                {**asdict(each), "right": each.right, "wrong": each.wrong, "silent": each.silent, "counts": each.counts}
+                for each in self.segments
+            ],
+            "alarms": [asdict(each) for each in self.alarms],
+            "events": [asdict(each) for each in self.events],
+        }
+
+
+def run_and_judge(clip: Clip, features: list[Features], frontend: Any, seed: int) -> Judged:
+    """Track a clip, and hold what the odometry says against the truth."""
+    truth = clean_truth(Trajectory(clip.times, clip.world_from_cam))[0]
+    odometry = VisualOdometry(frontend, clip.camera, OdometrySettings(seed=seed))
+    restarts = []
+    interval = OdometrySettings().health.interval
+    before: Trajectory | None = None
+    for number, (one, time) in enumerate(zip(features, clip.times.tolist(), strict=True)):
+        known = len(odometry.events)
+        if odometry.state is TrackingState.PROVISIONAL and number % interval == 0:
+            before = odometry.trajectory  # a check may start it anew
+        odometry.track_features(one, time)
+        for event in odometry.events[known:]:
+            if event.kind == "contradiction" and "anew" in event.detail and before is not None:
+                running = int(before.segment.max())
+                error = _error_percent(before, truth, running)[1]
+                restarts.append(Alarm(number, event.detail, error, error is not None and error < RIGHT_PERCENT))
+    odometry.finish()
+    estimate = odometry.trajectory
+    segments = [_judged(segment, estimate, truth, odometry.events) for segment in odometry.segments]
+    alarms = restarts + [
+        Alarm(each.last, each.doubt, each.error_percent, each.right)
+        for each in segments
+        if each.doubt and not each.doubt.startswith("not judged")  # which is neither a claim nor an alarm
+    ]
+    return Judged(_frames(clip, estimate, truth, segments), segments, alarms, list(odometry.events))
+
+
+def doubt(segment: Segment, events: Sequence[Event]) -> str:
+    """What the run itself says against a segment; empty where it claims that it is right."""
+    said = [each.detail for each in events if each.kind in DOUBTS and segment.first <= each.frame_index <= segment.last]
+    if said:
+        return said[0]
+    if segment.reason.startswith("contradicted"):
+        return segment.reason
+    verdict = getattr(segment, "verdict", None)
+    word = getattr(verdict, "word", "right")
+    return "" if word == "right" else f"{word}: {'; '.join(getattr(verdict, 'evidence', ()))}"
+
+
+def _judged(segment: Segment, estimate: Trajectory, truth: Trajectory, events: Sequence[Event]) -> JudgedSegment:
+    path, error = _error_percent(estimate, truth, segment.number)
+    return JudgedSegment(
+        segment.number,
+        segment.first,
+        segment.last,
+        segment.frames,
+        path,
+        error,
+        segment.reason,
+        doubt(segment, events),
+    )
+
+
+def _error_percent(estimate: Trajectory, truth: Trajectory, number: int) -> tuple[float, float | None]:
+    """True path in metres, and the error after Sim3 in % of it."""
+    rows = np.flatnonzero(estimate.valid & truth.valid[: len(estimate)] & (estimate.segment == number))
+    centres = truth.camera_centers[rows]
+    path = float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
+    if len(rows) < 3 or path < MIN_PATH:
+        return path, None
+    try:
+        motion = align(centres, estimate.camera_centers[rows], "sim3")
+    except InputError:
+        return path, None
+    distance = np.linalg.norm(motion.apply(estimate.camera_centers[rows]) - centres, axis=1)
+    return path, 100.0 * float(np.sqrt((distance**2).mean())) / path
+
+
+def _frames(clip: Clip, estimate: Trajectory, truth: Trajectory, segments: list[JudgedSegment]) -> str:
+    """A letter for each frame."""
+    rotation_wrong = _rotation_wrong(estimate, truth)
+    right_segments = {segment.number for segment in segments if segment.right}
+    letters = []
+    for row, has_pose in enumerate(estimate.valid.tolist()):
+        if not clip.trackable[row]:
+            letters.append(POSE_OF_NOTHING if has_pose else IMPOSSIBLE)
+        elif not has_pose:
+            letters.append(NONE)
+        else:
+            right = int(estimate.segment[row]) in right_segments and not rotation_wrong[row]
+            letters.append(RIGHT if right else WRONG)
+    return "".join(letters)
+
+
+def _rotation_wrong(estimate: Trajectory, truth: Trajectory) -> Any:
+    """(N,) frames whose turn within the second that begins with them, or ends, differs from the true one."""
+    wrong_from, wrong_to = np.zeros(len(estimate), bool), np.zeros(len(estimate), bool)
+    judged_from, judged_to = wrong_from.copy(), wrong_to.copy()
+    usable = np.flatnonzero(estimate.valid & truth.valid[: len(estimate)])
+    times = estimate.times[usable]
+    for row in usable.tolist():
+        after = usable[np.argmin(np.abs(times - estimate.times[row] - 1.0))]
+        if (
+            estimate.segment[after] != estimate.segment[row]
+            or abs(estimate.times[after] - estimate.times[row] - 1) > 0.2
+        ):
+            continue
+        turn, true_turn = (_turn(each.world_from_cam, row, after) for each in (estimate, truth))
+        wrong = bool(rotation_angle_deg((true_turn.T @ turn)[None])[0] > RIGHT_ROTATION_DEG)
+        wrong_from[row], judged_from[row] = wrong, True
+        wrong_to[after], judged_to[after] = wrong, True
+    return (wrong_from | ~judged_from) & (wrong_to | ~judged_to) & (judged_from | judged_to)
+
+
+def _turn(world_from_cam: Float64, first: int, last: int) -> Float64:
+    turn: Float64 = world_from_cam[last, :3, :3].T @ world_from_cam[first, :3, :3]
+    return turn

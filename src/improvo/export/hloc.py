@@ -1,0 +1,92 @@
+"""Features and matches as hloc keeps them: HDF5 files with a group for each image and for each pair.
+
+hloc counts pixels as we do, the centre of the top-left one at (0, 0), and moves them by half a pixel where it hands
+them to COLMAP. Keypoints stay float32: float16, which hloc writes itself, rounds to half a pixel beyond 1024.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from improvo.errors import MissingExtraError
+from improvo.export.features import MatchedFrame
+from improvo.files import write_text, written_atomically
+from improvo.geometry.camera import Camera
+
+UNCERTAINTY = 1.0  # pixels of a keypoint, which hloc keeps beside them
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was written."""
+
+    images: int
+    keypoints: int
+    pairs: int
+    matches: int
+
+
+def check_h5py() -> Any:
+    """The package.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        import h5py
+    except ImportError:
+        raise MissingExtraError("writing hloc's HDF5 files", "hdf5") from None
+    return h5py
+
+
+def write_hloc(frames: Iterable[MatchedFrame], camera: Camera, folder: Path, descriptors: str) -> Written:
+    """Write `features.h5`, `matches.h5`, `pairs.txt`, and `intrinsics.txt` in the form of hloc's lists of queries.
+
+    Args:
+        frames: in order.
+        camera: pinhole, of all of them.
+        folder: of the files.
+        descriptors: `float16` or `float32`.
+
+    Raises:
+        MissingExtraError: without the package h5py.
+        OutputError: a file cannot be written.
+    """
+    h5py = check_h5py()
+    names, pairs = [], []
+    keypoints = matches = 0
+    with (
+        written_atomically(folder / "features.h5") as features_file,
+        written_atomically(folder / "matches.h5") as matches_file,
+        h5py.File(features_file, "w", libver="latest") as of_images,
+        h5py.File(matches_file, "w", libver="latest") as of_pairs,
+    ):
+        counts: dict[str, int] = {}
+        for frame in frames:
+            group = of_images.create_group(frame.name)
+            group["keypoints"] = frame.features.keypoints.astype(np.float32)
+            group["keypoints"].attrs["uncertainty"] = UNCERTAINTY
+            group["scores"] = frame.features.scores.astype(np.float32)
+            group["descriptors"] = frame.unit.T.astype(descriptors)
+            group["image_size"] = np.array([camera.width, camera.height])
+            counts[frame.name] = len(frame.features)
+            for earlier, found in frame.matches:
+                partner = np.full(counts[earlier], -1, "int16" if len(frame.features) < 2**15 else "int32")
+                partner[found[:, 0]] = found[:, 1]
+                pair = of_pairs.create_group(f"{earlier}/{frame.name}")  # names without folders: hloc's own rule
+                pair["matches0"] = partner
+                pair["matching_scores0"] = (partner >= 0).astype(np.float16)
+                pairs.append(f"{earlier} {frame.name}\n")
+                matches += len(found)
+            names.append(frame.name)
+            keypoints += len(frame.features)
+    numbers = (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5)  # COLMAP's pixels
+    pinhole = f"PINHOLE {camera.width} {camera.height} {' '.join(repr(float(value)) for value in numbers)}"
+    write_text(folder / "intrinsics.txt", "".join(f"{name} {pinhole}\n" for name in names))
+    write_text(folder / "pairs.txt", "".join(pairs))
+    return Written(len(names), keypoints, len(pairs), matches)

@@ -1,0 +1,64 @@
+"""The runtime where OpenVINO is not to be had: the same network in ONNX Runtime."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from improvo.errors import MissingExtraError
+from improvo.frontend.onnx_graph import NetworkNodes, OnnxGraph, add_heat_map
+from improvo.frontend.runtime import NetworkMaps
+from improvo.frontend.weights import Weights
+from improvo.types import Float32
+
+try:
+    import onnxruntime
+except ImportError:
+    raise MissingExtraError("the ONNX runtime", "onnxruntime") from None
+
+_FEATURE = "the ONNX runtime"
+_ERRORS_ONLY = 3  # severity of its log
+
+
+class OnnxRuntime:
+    """Runs a network on the CPU with ONNX Runtime; several threads may call it.
+
+    Args:
+        weights: of any architecture.
+        int8: compute all but the detector's and the stability head's last layer in eight bits, by the activation
+            ranges of the model card.
+        threads: 0 for as many as the machine has.
+    """
+
+    def __init__(self, weights: Weights, int8: bool = False, threads: int = 0) -> None:
+        self.name = "onnxruntime-int8" if int8 else "onnxruntime-float32"
+        graph = OnnxGraph(_FEATURE)
+        heads = NetworkNodes(graph, weights, weights.card.activation_ranges if int8 else {}).add("image")
+        outputs = {add_heat_map(graph, heads.pop("detector")): [None] * 4}
+        outputs |= {graph.node("Transpose", node, perm=[0, 2, 3, 1]): [None] * 4 for node in heads.values()}
+        self._session = _session(graph, outputs, threads)
+
+    def __call__(self, images: Float32) -> NetworkMaps:
+        """Maps of (B, 1, H, W) images in [0, 1] with sides that are multiples of 8."""
+        maps = self._session.run(None, {"image": np.ascontiguousarray(images, np.float32)})
+        return NetworkMaps(maps[0][:, 0], maps[1], maps[2] if len(maps) > 2 else None)
+
+
+def activation_ranges(weights: Weights, images: Float32, quantile: float) -> dict[str, float]:
+    """The `quantile` of what each convolution reads over (B, 1, H, W) images, by the name of the one that reads it."""
+    graph = OnnxGraph(_FEATURE)
+    nodes = NetworkNodes(graph, weights)
+    nodes.add("image")
+    found = _session(graph, {node: [None] * 4 for node in nodes.read.values()}, 0).run(None, {"image": images})
+    return {reader: float(np.quantile(values, quantile)) for reader, values in zip(nodes.read, found, strict=True)}
+
+
+def _session(graph: OnnxGraph, outputs: Mapping[str, list[Any]], threads: int) -> Any:
+    onnxruntime.disable_telemetry_events()  # builds for Windows have some
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.log_severity_level = _ERRORS_ONLY
+    model = graph.model("network", {name: (False, shape) for name, shape in outputs.items()})
+    return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])

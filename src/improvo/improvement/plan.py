@@ -1,0 +1,95 @@
+"""What the loop will cost: its labelling measured on a sample, the rest by the figures of `estimate`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from improvo.errors import InputError
+from improvo.frontend.weights import load_weights
+from improvo.improvement.estimate import Estimate, estimate
+from improvo.improvement.rounds import starting_weights
+from improvo.improvement.settings import ImproveSettings
+from improvo.labeling.plan import LabelPlan, plan_labels
+from improvo.sequences import open_sequence
+
+
+@dataclass(frozen=True)
+class ImprovePlan:
+    """Of some rounds."""
+
+    once: LabelPlan  # all recordings labelled once, by the frontend at the start
+    needed: Estimate
+
+    @property
+    def labelings(self) -> float:
+        """How often all recordings are labelled, over all rounds; parts of them more often than others."""
+        return self.needed.labeled_frames / max(self.once.frames, 1)
+
+
+def plan_improvement(
+    sequences: Sequence[Path],
+    settings: ImproveSettings,
+    rounds: int,
+    evaluate: Sequence[Path] = (),
+    on_frames: Callable[[int], None] = lambda count: None,
+) -> ImprovePlan:
+    """Label a sample with the weights that the loop starts from, and reckon.
+
+    Args:
+        sequences, settings, rounds, evaluate: see `improve`.
+        on_frames: is told the number of further frames of the sample processed.
+
+    Raises:
+        InputError: none of the samples could be labelled, or weights that cannot be read.
+    """
+    weights = starting_weights(settings.frontend.name)
+    frontend = replace(settings.frontend, name=str(weights))
+    paths = list(dict.fromkeys([*sequences, *evaluate]))
+    once = plan_labels(paths, settings.run_settings(settings.sequence, frontend), on_frames=on_frames)
+    held_back = round(once.frames * (len(evaluate) / len(paths) if evaluate else settings.split.share))
+    pixels = _pixels(paths, settings)
+    parameters = sum(tensor.size for tensor in load_weights(weights).tensors.values())
+    return ImprovePlan(once, estimate(settings, rounds, once.frames - held_back, held_back, pixels, parameters))
+
+
+def first_estimate(
+    sequences: Sequence[Path], settings: ImproveSettings, rounds: int, evaluate: Sequence[Path] = ()
+) -> Estimate | None:
+    """What all of it takes, from the lengths of the recordings alone; nothing of what is done already is taken off.
+
+    Args:
+        sequences, settings, rounds, evaluate: see `improve`.
+
+    Returns:
+        None where no recording can be opened, which the loop itself will say.
+    """
+    named = {path.resolve() for path in evaluate}
+    training = held_back = 0
+    for path in dict.fromkeys([*sequences, *evaluate]):
+        with suppress(InputError):
+            frames = open_sequence(path, settings.sequence).length or 0
+            held_back += frames if path.resolve() in named else 0
+            training += 0 if path.resolve() in named else frames
+    if not evaluate:
+        held_back = round(training * settings.split.share)
+        training -= held_back
+    if training + held_back == 0:
+        return None
+    paths = [*sequences, *evaluate]
+    parameters = sum(tensor.size for tensor in load_weights(starting_weights(settings.frontend.name)).tensors.values())
+    return estimate(settings, rounds, training, held_back, _pixels(paths, settings), parameters)
+
+
+def _pixels(paths: Sequence[Path], settings: ImproveSettings) -> int:
+    """Of a frame of the first recording that can be opened."""
+    for path in paths[:-1]:
+        try:
+            camera = open_sequence(path, settings.sequence).camera
+        except InputError:
+            continue
+        return camera.width * camera.height
+    camera = open_sequence(paths[-1], settings.sequence).camera
+    return camera.width * camera.height

@@ -1,0 +1,166 @@
+"""What labelling will cost, measured on a sample: core-hours, memory, disk, and time by the number of workers.
+
+A sample is the beginning of a few of the recordings, labelled in a process like that of a worker. Its processor time is
+measured and not its duration, so that other work on the machine hardly matters. The cost of a recording is taken to be
+that of opening it and a number for each frame; the first frames of a sample, which need a start of the map, are left
+out of the latter.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from improvo.errors import InputError
+from improvo.jobs.processes import Tick, run_in_processes
+from improvo.labeling.label_sequences import LabelJob, label_sequence
+from improvo.odometry.run_settings import RunSettings
+
+SAMPLES = 3  # recordings
+SAMPLE_FRAMES = 150  # of each
+_START_FRAMES = 30  # not counted in the seconds of a frame
+_LOOKED_AT = 100  # recordings that are opened for their length, at most
+_MIB = 1 << 20
+
+
+@dataclass(frozen=True)
+class LabelPlan:
+    """Of labelling some recordings with one core for each worker."""
+
+    recordings: int
+    frames: int  # of all; extrapolated where there are many recordings
+    longest_frames: int  # of one recording, which one worker does
+    sample_frames: int
+    frame_seconds: float  # of one core, for a frame
+    recording_seconds: float  # of one core, for opening a recording and loading what labels it
+    memory_mib: int  # of a worker; 0 where the system does not say
+    frame_bytes: float  # on disk
+
+    @property
+    def core_seconds(self) -> float:
+        """Of all."""
+        return self.frames * self.frame_seconds + self.recordings * self.recording_seconds
+
+    @property
+    def storage_mib(self) -> float:
+        """Of the label store."""
+        return self.frames * self.frame_bytes / _MIB
+
+    def seconds(self, workers: int) -> float:
+        """With so many workers, each with a free core; no less than the longest recording takes."""
+        longest = self.longest_frames * self.frame_seconds + self.recording_seconds
+        return max(self.core_seconds / min(workers, self.recordings), longest)
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """What one sample took."""
+
+    frames: int
+    opening: float  # seconds of the processor until the first frame was done
+    frame: float  # for a later frame, with all that is done at the end
+    memory_mib: int
+    folder_bytes: int
+
+
+def plan_labels(
+    paths: Sequence[Path],
+    settings: RunSettings,
+    pack: bool = False,
+    on_frames: Callable[[int], None] = lambda count: None,
+) -> LabelPlan:
+    """Label a sample, and reckon.
+
+    Args:
+        paths: of the recordings.
+        settings: of the odometry and the labels.
+        pack: whether the frames are kept beside the labels.
+        on_frames: is told the number of further frames of the sample processed.
+
+    Raises:
+        InputError: none of the samples could be labelled.
+    """
+    lengths = _lengths(paths, settings)
+    if not lengths:
+        raise InputError(f"{paths[0]}: cannot be opened, nor can any other recording that was tried; check the paths")
+    tried = list(lengths)
+    chosen = [tried[row] for row in np.unique(np.linspace(0, len(tried) - 1, SAMPLES).round().astype(int))]
+    short = replace(settings, sequence=replace(settings.sequence, max_frames=_sample_frames(settings)))
+    samples: list[_Sample] = []
+    failures: list[Exception] = []
+
+    def on_result(job: LabelJob, result: _Sample | Exception) -> None:
+        if isinstance(result, _Sample):
+            samples.append(result)
+        else:
+            failures.append(result)
+
+    with tempfile.TemporaryDirectory(prefix="improvo-plan-") as folder:
+        jobs = [LabelJob(f"sample-{row}", path, Path(folder), short, pack) for row, path in enumerate(chosen)]
+        run_in_processes(_sampled, jobs, on_result, on_frames, 1)
+    if not samples:
+        raise InputError(f"no sample could be labelled; the first: {failures[0]}")
+    mean_length = float(np.mean(list(lengths.values())))
+    return LabelPlan(
+        recordings=len(paths),
+        frames=sum(lengths.values()) if len(lengths) == len(paths) else round(mean_length * len(paths)),
+        longest_frames=max(lengths.values()),
+        sample_frames=sum(sample.frames for sample in samples),
+        frame_seconds=float(np.average([s.frame for s in samples], weights=[s.frames for s in samples])),
+        recording_seconds=float(np.median([sample.opening for sample in samples])),
+        memory_mib=max(sample.memory_mib for sample in samples),
+        frame_bytes=sum(sample.folder_bytes for sample in samples) / sum(sample.frames for sample in samples),
+    )
+
+
+def _lengths(paths: Sequence[Path], settings: RunSettings) -> dict[Path, int]:
+    """Frames of the recordings that can be opened, of a part of them where there are many."""
+    from improvo.sequences import open_sequence
+
+    lengths: dict[Path, int] = {}
+    for row in np.unique(np.linspace(0, len(paths) - 1, _LOOKED_AT).round().astype(int)):
+        with suppress(InputError):
+            length = open_sequence(paths[row], settings.sequence).length
+            if length:
+                lengths[paths[row]] = length
+    return lengths
+
+
+def _sample_frames(settings: RunSettings) -> int:
+    most = settings.sequence.max_frames
+    return SAMPLE_FRAMES if most is None else min(most, SAMPLE_FRAMES)
+
+
+def _sampled(job: LabelJob, tick: Tick) -> _Sample:
+    """Label the sample in this process, and look at the clock of the processor."""
+    begun = time.process_time()
+    ticks: list[float] = []
+
+    def timed() -> None:
+        ticks.append(time.process_time())
+        tick()
+
+    record = label_sequence(job, timed)
+    ended = time.process_time()
+    first = min(_START_FRAMES, len(ticks) // 2)
+    frame = (ended - ticks[first - 1]) / (len(ticks) - first) if first else (ended - begun) / max(len(ticks), 1)
+    files = [path for path in (job.store / job.name).rglob("*") if path.is_file()]
+    size = sum(path.stat().st_size for path in files)
+    return _Sample(record.frames, ticks[0] - begun, frame, _peak_mib(), size)
+
+
+def _peak_mib() -> int:
+    """Largest resident memory of this process so far; 0 where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return int(peak // (_MIB if sys.platform == "darwin" else 1024))

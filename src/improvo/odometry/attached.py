@@ -1,0 +1,140 @@
+"""What moves with the camera: a logo, a time stamp, a bonnet, a finger. It stands in the picture while the rest moves.
+
+A map of it fits as well as a map of the world, and says that the camera stands still. So it is found before any map is
+asked. Two views far enough apart in the picture are matched afresh. An essential matrix of the matches that clearly
+moved tells where a point of the world may be found again, at whatever depth: on its half of the epipolar line. A far
+point under a pure translation, the focus of expansion and the axis of a turn are there though they hardly move. A match
+that does not move and is off it is not of the world. It counts against its cell of the picture, and matches that move
+with the world count for it; both are slowly forgotten. Keypoints of a cell with more against than for it make no map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from improvo.geometry.a_contrario import line_probability, log10_false_alarms
+from improvo.geometry.camera import Camera
+from improvo.geometry.epipolar import half_line_distances
+from improvo.geometry.ransac import Ransac, relative_pose
+from improvo.odometry.settings import OdometrySettings
+from improvo.odometry.view import Mask, View, common_tracks
+from improvo.tracking.matching import match_units
+from improvo.types import Float64, Int64
+
+_COLUMNS, _ROWS = 16, 12  # cells of the picture
+_FEATURES = 600  # of each view, the strongest
+_MIN_MOVING = 20  # matches that moved; fewer say nothing about the camera
+_SIGNIFICANT = -6.0  # log10 of the number of false alarms of their essential matrix
+_MIN_SHARE = 0.5  # of them that agree with it
+_MOVED = 3.0  # times the noise: a match that moved so far did move
+_OFF = 1.5  # times the noise: a match so far from where a point of the world can be is not of it
+_KEPT = 0.8  # share of the evidence that is left after each comparison
+_ENOUGH = 3.0  # matches against a cell,
+_MOST = 2  # of which one comparison gives so many
+_SHORTEST = 5  # frames between two views that are compared, where enough tracks last; a slow world moves by then
+_LONGEST = 30  # frames between two views that are compared
+
+
+class AttachedDetector:
+    """Marks the keypoints of each view that belong to something attached to the camera.
+
+    Args:
+        camera: pinhole camera of the views.
+        settings: of the odometry; `attached` and `seed` are used.
+        descriptor_distance: the matching threshold on unit descriptors.
+    """
+
+    def __init__(self, camera: Camera, settings: OdometrySettings, descriptor_distance: float) -> None:
+        self._camera = camera
+        self._settings = settings.attached
+        self._seed = settings.seed
+        self._descriptor_distance = descriptor_distance
+        self._noise = settings.attached.noise * max(1.0, camera.width / 640.0)
+        self._anchor: View | None = None
+        self._against, self._for = np.zeros(_ROWS * _COLUMNS), np.zeros(_ROWS * _COLUMNS)
+
+    @property
+    def cells(self) -> Mask:
+        """(C,) cells of the picture, row by row, that show something attached to the camera."""
+        against, world = _with_neighbours(self._against), _with_neighbours(self._for)
+        return (against >= _ENOUGH) & (against > world)
+
+    def observe(self, view: View) -> bool:
+        """Mark the keypoints of the newest view.
+
+        Returns:
+            Whether other cells than before are attached now; earlier views can be marked anew with `mark`.
+        """
+        before = self.cells
+        if self._settings.enabled:
+            self._compare(view)
+        self.mark([view])
+        return bool((self.cells & ~before).any())
+
+    def mark(self, views: Iterable[View]) -> None:
+        """Mark the keypoints of views by what is known now; a keypoint that moves is none, wherever it is."""
+        cells = self.cells
+        for view in views:
+            view.attached = cells[self._cell(view.keypoints)]
+            if view.attached.any() and self._anchor is not None and self._anchor is not view:
+                rows, rows_anchor = common_tracks(view, self._anchor)
+                moved = np.linalg.norm(view.keypoints[rows] - self._anchor.keypoints[rows_anchor], axis=1)
+                view.attached[rows[moved > _MOVED * self._noise]] = False
+
+    def _cell(self, pixels: Float64) -> Int64:
+        column = np.clip(pixels[:, 0] * _COLUMNS / self._camera.width, 0, _COLUMNS - 1).astype(np.int64)
+        row = np.clip(pixels[:, 1] * _ROWS / self._camera.height, 0, _ROWS - 1).astype(np.int64)
+        return row * _COLUMNS + column
+
+    def _compare(self, view: View) -> None:
+        """With the anchor, where the picture moved enough since then; then this view is the anchor."""
+        anchor = self._anchor
+        if anchor is not None and view.frame_index - anchor.frame_index <= _LONGEST:
+            # a track that is not younger than the anchor was seen in it, since tracks have no gaps
+            few_left = (view.tracks <= anchor.tracks.max(initial=-1)).sum() < 2 * _MIN_MOVING
+            if not few_left and view.frame_index - anchor.frame_index < _SHORTEST:
+                return
+            rows, rows_anchor = common_tracks(view, anchor)
+            motion = np.linalg.norm(view.keypoints[rows] - anchor.keypoints[rows_anchor], axis=1)
+            moved = motion[motion > _MOVED * self._noise]
+            if not few_left and (len(moved) < _MIN_MOVING or np.median(moved) < self._settings.min_flow * self._noise):
+                return
+            self._weigh(anchor, view)
+        self._anchor = view
+
+    def _weigh(self, anchor: View, view: View) -> None:
+        """Evidence from two views."""
+        matches = match_units(anchor.descriptors[:_FEATURES], view.descriptors[:_FEATURES], self._descriptor_distance)
+        before, now = anchor.keypoints[matches[:, 0]], view.keypoints[matches[:, 1]]
+        cells = self._cell(now)
+        motion = np.linalg.norm(now - before, axis=1)
+        still, moved = motion <= self._noise, np.flatnonzero(motion > _MOVED * self._noise)
+        occupied = len(np.unique(cells[still])), len(np.unique(cells[moved]))
+        if len(moved) < _MIN_MOVING or occupied[1] < self._settings.min_moving_cells * sum(occupied):
+            return
+        ransac = Ransac(self._noise, self._seed, min_iterations=100, max_iterations=1000)
+        world = relative_pose(before[moved], now[moved], self._camera, ransac)
+        chance = line_probability(self._camera.width, self._camera.height, self._noise)
+        inliers = int(world.inliers.sum())
+        if inliers < _MIN_SHARE * len(moved) or (
+            log10_false_alarms(len(moved), inliers, chance, sample=5, models=10) > _SIGNIFICANT
+        ):
+            return
+        errors = half_line_distances(world.pose, self._camera, before[still], now[still])
+        self._against *= _KEPT
+        self._for *= _KEPT
+        self._against += self._counted(cells[still][errors > _OFF * self._noise])
+        self._for += self._counted(cells[moved[world.inliers]])
+
+    def _counted(self, cells: Int64) -> Float64:
+        """Matches in each cell (C,); a single comparison may not decide about one."""
+        return np.minimum(np.bincount(cells, minlength=_ROWS * _COLUMNS), _MOST).astype(np.float64)
+
+
+def _with_neighbours(evidence: Float64) -> Float64:
+    """Evidence (C,) of each cell and a quarter of what the four cells beside it have: few things are one cell large."""
+    grid = np.pad(evidence.reshape(_ROWS, _COLUMNS), 1)
+    beside = grid[:-2, 1:-1] + grid[2:, 1:-1] + grid[1:-1, :-2] + grid[1:-1, 2:]
+    return np.asarray(grid[1:-1, 1:-1] + 0.25 * beside).ravel()

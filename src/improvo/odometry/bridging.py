@@ -1,0 +1,103 @@
+"""Joining a new map with that of a segment that ended before, where the camera sees the same place again.
+
+Two views of the new map must find the former one, and agree on where it lies and how large it is. Otherwise two
+segments with scales of their own stand side by side, placed by guess.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from improvo.geometry import se3
+from improvo.geometry.alignment import Similarity
+from improvo.odometry.former_map import FormerMap, Sighting
+from improvo.odometry.settings import BridgingSettings
+from improvo.odometry.view import View
+from improvo.types import Float64
+
+_FORMER_MAPS = 2  # kept; the camera seldom returns to an older place within so few frames
+_LARGEST_DISTANCE = 0.05  # between the places of a camera by two sightings, as a share of its distance to the points
+_LARGEST_ANGLE_DEG = 3.0
+_LARGEST_SCALE_CHANGE = 0.1  # of the logarithm, besides three standard errors
+
+
+@dataclass(frozen=True)
+class Join:
+    """Where the running map lies in a former one."""
+
+    number: int  # of the former segment
+    shared_from_new: Similarity  # from the running map's own world to the one that all segments are placed in
+    scale_error: float  # relative
+    points: int  # of the former map, found by the view that decided
+
+
+class Bridging:
+    """Looks for the former maps in the views of a new one.
+
+    Args:
+        settings: how long, and how sure.
+    """
+
+    def __init__(self, settings: BridgingSettings) -> None:
+        self._settings = settings
+        self._former: list[FormerMap] = []
+        self._sightings: dict[int, list[Sighting]] = {}  # by row of the former map
+        self._found = False  # in which the running map lies
+
+    def remember(self, former: FormerMap) -> None:
+        """A segment has ended; where it went on with a former one, both maps are kept."""
+        self._former = [*self._former, former][-_FORMER_MAPS:]
+        self._sightings = {}
+
+    def new_map(self) -> None:
+        """What was seen from another map does not count any more."""
+        self._sightings, self._found = {}, False
+
+    def look(self, view: View, xyz: Float64) -> Join | None:
+        """The join that this view decides, if it and another one agree.
+
+        Args:
+            view: of the running map, with a pose.
+            xyz: (P, 3) points of the running map.
+        """
+        if self._found:
+            return None
+        oldest = view.frame_index - self._settings.max_frames
+        for row, former in enumerate(self._former):
+            if former.last_frame < oldest:
+                continue
+            sighting = former.sighting(view, xyz)
+            if sighting is None:
+                continue
+            for other in self._sightings.get(row, []):
+                join = _joined(former, other, sighting)
+                if join is not None and join.scale_error <= self._settings.max_scale_error:
+                    self._found = True
+                    return join
+            self._sightings.setdefault(row, []).append(sighting)
+        return None
+
+
+def _joined(former: FormerMap, a: Sighting, b: Sighting) -> Join | None:
+    """Both sightings as one; None where they contradict each other."""
+    errors = np.maximum([a.scale_error, b.scale_error], 1e-4)
+    logs = np.log([a.former_from_new.scale, b.former_from_new.scale])
+    change = float(abs(logs[1] - logs[0]))
+    if change > _LARGEST_SCALE_CHANGE + 3.0 * float(np.hypot(*errors)):
+        return None
+    angle = se3.rotation_angle_deg(a.former_from_new.rotation.T @ b.former_from_new.rotation)
+    distance = np.linalg.norm(a.former_from_new.apply(b.center) - b.former_pose[:3, 3])
+    if float(angle) > _LARGEST_ANGLE_DEG or distance > _LARGEST_DISTANCE * b.depth:
+        return None
+    log_scale = float(np.average(logs, weights=errors**-2.0))
+    better = a if a.inliers >= b.inliers else b
+    scale, rotation = float(np.exp(log_scale)), better.former_from_new.rotation
+    here, there = 0.5 * (a.center + b.center), 0.5 * (a.former_pose[:3, 3] + b.former_pose[:3, 3])
+    return Join(
+        number=former.number,
+        shared_from_new=former.shared_from_own.after(Similarity(scale, rotation, there - scale * rotation @ here)),
+        scale_error=max(float((errors**-2.0).sum() ** -0.5), 0.5 * change),
+        points=better.inliers,
+    )

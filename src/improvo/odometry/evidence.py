@@ -1,0 +1,239 @@
+"""Does the path depend on which part of the evidence is believed? The path again, from parts of the observations.
+
+The keyframes of a segment are adjusted again in windows that overlap, each time from another part of what they
+observed: without one quarter of the picture, or with one half of the points. Each part gives a path of its own. Noise
+and few matches spread the paths from halves of the points. What one part of the picture says otherwise (an overlay, a
+mover, a wrong lens) spreads the paths without its quarters. A place that few points carry the scale across lets each
+part go on with another scale there. This is a jackknife (Quenouille 1949; Tukey 1958) over picture and points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from improvo.backend.settings import ObjectiveSettings, SolverSettings
+from improvo.backend.solver import solve
+from improvo.errors import InputError
+from improvo.geometry import se3
+from improvo.geometry.alignment import align_points
+from improvo.geometry.camera import Camera
+from improvo.odometry.evidence_window import EvidenceKeyframe, EvidenceWindow
+from improvo.odometry.lens_evidence import LensMeasure, measured_lens
+from improvo.odometry.settings import VerdictSettings
+from improvo.odometry.view import Mask, View
+from improvo.types import Float64, Int64
+
+QUARTERS = ("without the upper left", "without the upper right", "without the lower left", "without the lower right")
+HALVES = ("half of the points", "the other half of the points")
+PARTS = (*QUARTERS, *HALVES)
+
+_SOLVER = SolverSettings(max_iterations=8, relative_decrease=1e-3)
+_FEW = 8  # observations or common points; fewer determine nothing
+_THIN = 6  # points seen on both sides of a gap between two keyframes; fewer carry no scale across it
+_LENS_KEYFRAMES = 8  # of a window that may say something of the focal length
+_UNDETERMINED = 0.11  # change of the logarithm of the scale that then counts, at least: enough for a mark
+_HASH = 2654435761  # a multiplier of Knuth's, so that the halves of the points are no halves of time or place
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How far the paths from the parts of the evidence are from the segment's own.
+
+    Attributes:
+        error_percent: (PARTS,) root mean square distance of the keyframes' positions after Sim3, % of the path.
+        scale_steps: (L, PARTS) change of the logarithm of a part's scale across each of L links between windows.
+        link_frames: (L, 2) first and last frame of the keyframes on both sides of each link.
+        noise_px: of the observations, standard deviation of one coordinate; NaN where nothing was observed.
+        fewest: observations that a keyframe has, at least.
+        keyframes: of the segment.
+        lens: what the windows say of the focal length.
+    """
+
+    error_percent: Float64
+    scale_steps: Float64
+    link_frames: Int64
+    noise_px: float
+    fewest: int
+    keyframes: int
+    lens: tuple[LensMeasure, ...] = ()
+
+
+@dataclass
+class _Solution:
+    """A window adjusted from one part of its observations, in a gauge of its own."""
+
+    cam_from_world: Float64  # (W, 4, 4)
+    rows: Int64  # (K,) rows of the window's points that it has, increasing
+    ids: Int64  # (K,) map points
+    xyz: Float64  # (K, 3)
+
+
+@dataclass
+class _Path:
+    """The path that one part of the evidence gives, window after window."""
+
+    centers: list[Float64] = field(default_factory=list)  # (3,) each, one per keyframe
+    world_from_cam: list[Float64] = field(default_factory=list)  # (4, 4) each, of the last window's keyframes
+    scale: float = 1.0  # world units of this path per unit of the last window's gauge
+    own_scale: float = 0.0  # logarithm of the path's scale over the segment's, in the last window
+    last: _Solution | None = None
+
+
+class EvidenceCheck:
+    """Takes a segment's keyframes as they become final, and adjusts them again from each part of the evidence.
+
+    Args:
+        camera: pinhole camera of the views.
+        settings: length of the windows.
+        objective: of the bundle adjustment.
+    """
+
+    def __init__(self, camera: Camera, settings: VerdictSettings, objective: ObjectiveSettings) -> None:
+        self._camera = camera
+        self._settings = settings
+        self._objective = objective
+        self._pending: list[EvidenceKeyframe] = []  # of the next window; those of the overlap are first
+        self._overlap = 0
+        self._paths = [_Path() for _ in PARTS]
+        self._centers: list[Float64] = []  # of the segment itself, one per keyframe
+        self._errors: list[float] = []  # pixels, median of each window
+        self._scale_steps: list[Float64] = []
+        self._links: list[tuple[int, int]] = []
+        self._lens: list[LensMeasure] = []
+        self._lens_due = True  # every other window: those between them share half of their keyframes with each
+        self._fewest = np.iinfo(np.int64).max
+
+    def add(self, view: View, cam_from_world: Float64, xyz: Float64) -> None:
+        """The next keyframe is final.
+
+        Args:
+            view: the keyframe.
+            cam_from_world: (4, 4) its pose.
+            xyz: (P, 3) the map as it is now.
+        """
+        rows = view.observed
+        keyframe = EvidenceKeyframe(
+            view.frame_index, cam_from_world, view.keypoints[rows], view.points[rows], view.weights[rows]
+        )
+        self._pending.append(keyframe)
+        self._centers.append(se3.inverse(cam_from_world)[:3, 3])
+        self._fewest = min(self._fewest, len(rows))
+        if len(self._pending) == self._settings.window:
+            self._solve_window(xyz)
+
+    def finish(self, xyz: Float64) -> Spread | None:
+        """The segment is over.
+
+        Args:
+            xyz: (P, 3) its points.
+
+        Returns:
+            None where the segment has too few keyframes for a spread.
+        """
+        if len(self._pending) > self._overlap and len(self._centers) >= 3:
+            self._solve_window(xyz)
+        if len(self._centers) < 3:
+            return None
+        own = np.stack(self._centers)
+        errors = [error_percent(np.stack(path.centers), own) for path in self._paths]
+        return Spread(
+            error_percent=np.array(errors),
+            scale_steps=np.array(self._scale_steps).reshape(-1, len(PARTS)),
+            link_frames=np.array(self._links, np.int64).reshape(-1, 2),
+            noise_px=float(np.median(self._errors)) / 1.1774 if self._errors else float("nan"),
+            fewest=int(self._fewest),
+            keyframes=len(self._centers),
+            lens=tuple(self._lens),
+        )
+
+    def _solve_window(self, xyz: Float64) -> None:
+        """All parts of the pending keyframes; the second half of them is the overlap with the next window."""
+        keyframes = self._pending
+        window = EvidenceWindow.of(keyframes, xyz)
+        errors = window.errors(self._camera)
+        self._errors.extend([float(np.median(errors))] if len(errors) else [])
+        frames = keyframes[0].frame_index, keyframes[-1].frame_index
+        steps = np.zeros(len(PARTS))
+        for part, (path, mask) in enumerate(zip(self._paths, self._masks(window), strict=True)):
+            steps[part] = _continue(path, self._solved(window, mask), window, self._overlap)
+        thin = window.fewest_across() < _THIN
+        if thin:
+            steps = np.maximum(np.abs(steps), _UNDETERMINED)
+        if self._overlap or thin:
+            self._scale_steps.append(steps)
+            self._links.append(frames)
+        if self._lens_due and len(keyframes) >= _LENS_KEYFRAMES:
+            self._lens.append(measured_lens(window, frames, self._camera, self._objective))
+        self._lens_due = not self._lens_due
+        self._overlap = min(self._settings.window // 2, len(keyframes))
+        self._pending = keyframes[len(keyframes) - self._overlap :]
+        for path in self._paths:
+            path.world_from_cam = path.world_from_cam[-self._overlap :]
+
+    def _masks(self, window: EvidenceWindow) -> list[Mask]:
+        """Which observations (O,) belong to each of PARTS."""
+        left = window.keypoints[:, 0] < 0.5 * self._camera.width
+        upper = window.keypoints[:, 1] < 0.5 * self._camera.height
+        half = ((window.ids[window.point] * _HASH) >> 7) & 1 == 0
+        return [~(upper & left), ~(upper & ~left), ~(~upper & left), ~(~upper & ~left), half, ~half]
+
+    def _solved(self, window: EvidenceWindow, mask: Mask) -> _Solution:
+        """The window from a part of its observations; where it starts, if they are too few."""
+        problem, rows = window.problem(window.seen_at_least(2, mask), self._camera.K)
+        if len(problem.keypoints) < _FEW * len(window):
+            return _Solution(window.cam_from_world, rows, window.ids[rows], window.xyz[rows])
+        result = solve(problem, self._objective, _SOLVER)
+        return _Solution(result.cam_from_world, rows, window.ids[rows], result.points)
+
+
+def error_percent(path: Float64, reference: Float64) -> float:
+    """Root mean square distance of positions (N, 3) after Sim3, as % of the reference's path."""
+    length = np.linalg.norm(np.diff(reference, axis=0), axis=1).sum()
+    try:
+        aligned = align_points(reference, path, with_scale=True).apply(path)
+    except InputError:  # all on one spot
+        return float("inf")
+    return float(100.0 * np.sqrt(((aligned - reference) ** 2).sum(axis=1).mean()) / max(length, 1e-300))
+
+
+def _continue(path: _Path, solution: _Solution, window: EvidenceWindow, overlap: int) -> float:
+    """Append a solved window to a path; returns how the logarithm of the path's scale has changed.
+
+    The overlap's middle keyframe carries pose and the points seen in the overlap carry scale from window to window.
+    """
+    poses = solution.cam_from_world
+    reference = max(overlap - 1, 0) // 2
+    if path.last is None:
+        world_from_reference = se3.inverse(poses[0])
+    else:
+        world_from_reference = path.world_from_cam[reference]
+        before, after = _common(path.last, solution, window.ids[np.unique(window.point[window.camera < overlap])])
+        before_from_world = path.last.cam_from_world[len(path.last.cam_from_world) - overlap + reference]
+        path.scale *= _ratio(se3.transform(before_from_world, before), se3.transform(poses[reference], after))
+    for pose in poses[overlap:]:
+        reference_from_cam = poses[reference] @ se3.inverse(pose)
+        reference_from_cam[:3, 3] *= path.scale
+        path.world_from_cam.append(world_from_reference @ reference_from_cam)
+        path.centers.append(path.world_from_cam[-1][:3, 3])
+    newest = np.isin(solution.rows, window.newest)
+    theirs = se3.transform(poses[-1], solution.xyz[newest])
+    own = se3.transform(window.cam_from_world[-1], window.xyz[solution.rows[newest]])
+    own_scale = float(np.log(path.scale * _ratio(theirs, own)))
+    step, path.own_scale, path.last = own_scale - path.own_scale, own_scale, solution
+    return step
+
+
+def _common(a: _Solution, b: _Solution, seen: Int64) -> tuple[Float64, Float64]:
+    """Positions (C, 3) in both solutions of the points that both have and the overlap has seen."""
+    ids, rows_a, rows_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
+    use = np.isin(ids, seen)
+    return a.xyz[rows_a[use]], b.xyz[rows_b[use]]
+
+
+def _ratio(a: Float64, b: Float64) -> float:
+    """Median ratio of the distances of points (N, 3) in the same camera, in two units; 1 where they are too few."""
+    if len(a) < _FEW:
+        return 1.0
+    return float(np.median(np.linalg.norm(a, axis=1) / np.maximum(np.linalg.norm(b, axis=1), 1e-12)))

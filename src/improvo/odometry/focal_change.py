@@ -1,0 +1,60 @@
+"""Did the lens zoom between two frames? Every distance in the picture grows at once, and no motion explains it.
+
+Two views cannot tell a zoom from a step ahead: both move every point along a line through the middle of the picture.
+The map can, since a step moves near points more than far ones. So where distances between tracked keypoints change by
+more than a few percent in one frame, the pose from map points is found twice, with the camera as it is given and with
+the focal length scaled by that change. If the second explains clearly more points, the lens has changed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from improvo.geometry.camera import Camera
+from improvo.geometry.ransac import Ransac, absolute_pose
+from improvo.odometry.view import View, common_tracks
+from improvo.types import Float64
+
+_LEAST = np.log(1.08)  # change of the distances in one frame; a step ahead rarely changes them by more
+_MIN_POINTS = 20  # of the map, in both views
+_BETTER = 1.25  # times as many points must fit with the other focal length,
+_MORE = 8  # and so many more
+_TOLERANCE = 0.5  # times the map's own largest error, since a zoom is told by what lies close
+
+
+def focal_change(before: View, view: View, xyz: Float64, camera: Camera, max_error: float, seed: int) -> float:
+    """By which factor the focal length changed between two consecutive views; 1 where it did not.
+
+    Args:
+        before: with points of the map.
+        view: the next one, without a pose yet.
+        xyz: (P, 3) points of the map.
+        camera: as it is given, of both.
+        max_error: pixels, largest error of an observation of the map.
+        seed: of the RANSAC.
+    """
+    rows, rows_before = common_tracks(view, before)
+    known = before.points[rows_before] >= 0
+    rows, rows_before = rows[known], rows_before[known]
+    if len(rows) < _MIN_POINTS:
+        return 1.0
+    factor = _scale(before.keypoints[rows_before], view.keypoints[rows])
+    if abs(np.log(factor)) < _LEAST:
+        return 1.0
+    points, pixels = xyz[before.points[rows_before]], view.keypoints[rows]
+    ransac = Ransac(_TOLERANCE * max_error, seed, min_iterations=100, max_iterations=1000)
+    zoomed = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+    as_given, changed = (int(absolute_pose(points, pixels, each, ransac).inliers.sum()) for each in (camera, zoomed))
+    return factor if changed >= max(_BETTER * as_given, as_given + _MORE) else 1.0
+
+
+def _scale(before: Float64, now: Float64) -> float:
+    """Median ratio of the distances between matched pixels (N, 2), of pairs that lie well apart."""
+    half = len(before) // 2
+    order = np.argsort(before[:, 0] + before[:, 1], kind="stable")
+    first, second = order[:half], order[half : 2 * half]
+    old = np.linalg.norm(before[first] - before[second], axis=1)
+    new = np.linalg.norm(now[first] - now[second], axis=1)
+    return float(np.median(np.maximum(new, 1e-6) / np.maximum(old, 1e-6)))

@@ -1,0 +1,48 @@
+"""Collects what speaks for and against a segment while it runs, and judges it at its end."""
+
+from __future__ import annotations
+
+from improvo.geometry.camera import Camera
+from improvo.odometry.evidence import EvidenceCheck
+from improvo.odometry.settings import OdometrySettings
+from improvo.odometry.verdict import Verdict, judge
+from improvo.odometry.view import View
+from improvo.types import Float64
+
+
+class SegmentJudge:
+    """The evidence of one segment: its keyframes, and the alarms that do not end it.
+
+    Args:
+        camera: pinhole camera of the views.
+        settings: of the odometry; `verdict` and `objective` are used.
+    """
+
+    def __init__(self, camera: Camera, settings: OdometrySettings) -> None:
+        self._settings = settings
+        self._evidence = EvidenceCheck(camera, settings.verdict, settings.objective)
+        self._alarms: list[str] = []
+
+    def final(self, view: View, cam_from_world: Float64, xyz: Float64) -> None:
+        """A view is final; keyframes are evidence.
+
+        Args:
+            view: of the segment, in temporal order.
+            cam_from_world: (4, 4) its pose.
+            xyz: (P, 3) the map as it is now.
+        """
+        if view.keyframe:
+            self._evidence.add(view, cam_from_world, xyz)
+
+    def alarm(self, words: str) -> None:
+        """Something that makes the segment doubtful, whatever its path looks like; the same words count once."""
+        if words not in self._alarms:
+            self._alarms.append(words)
+
+    def verdict(self, xyz: Float64) -> Verdict:
+        """The verdict, now that the segment is over.
+
+        Args:
+            xyz: (P, 3) its points.
+        """
+        return judge(self._evidence.finish(xyz), self._settings.verdict, tuple(self._alarms))

@@ -1,0 +1,55 @@
+"""The verdicts of a run as its run.json has them: which frames are in doubt, and lines for a person."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from improvo.odometry.verdict import DOUBTFUL, NOT_JUDGED
+from improvo.odometry.view import Mask
+from improvo.types import Int64
+
+
+def verdict_of(segment: Mapping[str, Any]) -> dict[str, Any]:
+    """The verdict in a segment of run.json; `not judged` in one that was written before there were verdicts."""
+    if "verdict" not in segment:
+        return {"word": NOT_JUDGED, "error_percent": None, "noise_px": None, "evidence": [], "uncertain": []}
+    return dict(segment["verdict"])
+
+
+def doubtful_frames(report: Mapping[str, Any], segment: Int64) -> Mask:
+    """(F,) frames whose segment is doubtful.
+
+    Args:
+        report: the content of run.json.
+        segment: (F,) segment of each frame, -1 without a pose.
+    """
+    numbers = [each["number"] for each in report["segments"] if verdict_of(each)["word"] == DOUBTFUL]
+    return np.isin(segment, numbers)
+
+
+def uncertain_frames(report: Mapping[str, Any], frame_indices: Int64) -> Mask:
+    """(N,) frames within a stretch whose scale is not determined.
+
+    Args:
+        report: the content of run.json.
+        frame_indices: (N,) of frames with a pose.
+    """
+    found = np.zeros(len(frame_indices), np.bool_)
+    for each in report["segments"]:
+        for first, last in verdict_of(each)["uncertain"]:
+            found |= (frame_indices >= first) & (frame_indices <= last)
+    return found
+
+
+def verdict_lines(report: Mapping[str, Any]) -> list[str]:
+    """One line for each segment: its frames, the word, and why."""
+    lines = []
+    for each in report["segments"]:
+        verdict = verdict_of(each)
+        why = "; ".join(verdict["evidence"]) or "there is no verdict of it"
+        frames = f"frames {each['first']} to {each['last']}"
+        lines.append(f"segment {each['number']} ({frames}) is {verdict['word']}: {why}")
+    return lines

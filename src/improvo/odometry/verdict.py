@@ -1,0 +1,154 @@
+"""The verdict of a segment: is its path right, as far as its own evidence can tell?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from improvo.odometry.evidence import HALVES, PARTS, QUARTERS, Spread
+from improvo.odometry.settings import VerdictSettings
+from improvo.types import Float64
+
+_SIGMAS = 5.0  # standard errors that a deviation of the focal length must exceed
+_LARGEST_LENS_ERROR = 0.06  # of the logarithm of a focal length; a window that knows it less well says nothing of it
+RIGHT, DOUBTFUL, NOT_JUDGED = "right", "doubtful", "not judged"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a segment's path is believed, and why.
+
+    Attributes:
+        word: `right`, `doubtful`, or `not judged` where nothing could be measured.
+        error_percent: estimated error of the positions after Sim3, % of the segment's own path; NaN: not measured.
+        noise_px: of the observations, standard deviation of one coordinate; NaN: not measured.
+        evidence: why, in plain words.
+        uncertain: first and last frame of each stretch whose scale is not determined.
+    """
+
+    word: str
+    error_percent: float = float("nan")
+    noise_px: float = float("nan")
+    evidence: tuple[str, ...] = ()
+    uncertain: tuple[tuple[int, int], ...] = ()
+
+    def report(self) -> dict[str, Any]:
+        """For run.json, which knows no NaN."""
+        return {
+            "word": self.word,
+            "error_percent": _number(self.error_percent),
+            "noise_px": _number(self.noise_px),
+            "evidence": list(self.evidence),
+            "uncertain": [list(stretch) for stretch in self.uncertain],
+        }
+
+
+def judge(spread: Spread | None, settings: VerdictSettings, alarms: tuple[str, ...] = ()) -> Verdict:
+    """The verdict of a segment by the spread of its path, and by what else was seen.
+
+    Args:
+        spread: of the paths from the parts of the evidence; None where the segment is too short for one.
+        settings: the limits.
+        alarms: in plain words; each makes the segment doubtful.
+    """
+    if spread is None:
+        return Verdict(DOUBTFUL if alarms else NOT_JUDGED, evidence=(*alarms, "too few keyframes to judge the path"))
+    alarms = (*alarms, *_lens_alarms(spread, settings))
+    error = estimated_error(spread, settings)
+    uncertain = _uncertain(spread, settings)
+    evidence = [*alarms, _in_words(spread, error, settings)]
+    evidence += [f"frames {first} to {last}: the scale is not determined" for first, last in uncertain]
+    word = RIGHT if error <= settings.max_error and not alarms else DOUBTFUL
+    return Verdict(word, error, spread.noise_px, tuple(evidence), uncertain)
+
+
+def joined(first: Verdict, second: Verdict, scale_error: float) -> Verdict:
+    """The verdict of two stretches of one world, with a scale between them that is known to `scale_error` (relative).
+
+    The worse of the two counts; the scale between them moves half of the path by that share of its size at most.
+    """
+    if NOT_JUDGED in (first.word, second.word):
+        known = second if first.word == NOT_JUDGED else first
+        return Verdict(known.word, known.error_percent, known.noise_px, known.evidence, known.uncertain)
+    errors = first.error_percent, second.error_percent, 50.0 * scale_error
+    worse = first if first.error_percent >= second.error_percent else second
+    return Verdict(
+        DOUBTFUL if DOUBTFUL in (first.word, second.word) else RIGHT,
+        max(errors),
+        max(first.noise_px, second.noise_px),
+        (*worse.evidence, f"joined, scale ±{100 * scale_error:.1g} %"),
+        (*first.uncertain, *second.uncertain),
+    )
+
+
+def estimated_error(spread: Spread, settings: VerdictSettings) -> float:
+    """Error of the segment's positions after Sim3, % of its path.
+
+    The root sum of squares of what the parts' paths differ by, and of what the least certain change of scale moves.
+    """
+    scale = settings.scale_share * float(_scale_errors(spread).max(initial=0.0))
+    return float(np.hypot(np.linalg.norm(spread.error_percent), scale))
+
+
+def _scale_errors(spread: Spread) -> Float64:
+    """(L,) disagreement of the parts about the change of scale across each link, standard deviation of its log."""
+    return np.asarray(np.sqrt((spread.scale_steps**2).mean(axis=1)), np.float64)
+
+
+def _lens_alarms(spread: Spread, settings: VerdictSettings) -> tuple[str, ...]:
+    """What contradicts that one lens, the camera's, looked at one world that stands still; most telling first.
+
+    A focal length that is not the camera's can be a zoom or a wrong calibration. Where something large moves, too, its
+    motion and the camera's fit together only with a focal length that is wrong and changes.
+    """
+    alarms: list[str] = []
+    sure = [each for each in spread.lens if each.offset_error < _LARGEST_LENS_ERROR]
+    for each in spread.lens:
+        first, last = each.frames
+        if abs(each.growth) > max(settings.max_focal_change, _SIGMAS * each.growth_error):
+            alarms.append(_told(first, last, f"changes by {100 * abs(np.expm1(each.growth)):.0f} %"))
+    for each in sure:
+        first, last = each.frames
+        if abs(each.offset) > max(settings.max_focal_error, _SIGMAS * each.offset_error):
+            alarms.append(_told(first, last, f"is {np.exp(each.offset):.2f} times that of the camera as given"))
+    for a, b in pairwise(sure):
+        change = b.offset - a.offset
+        if abs(change) > max(settings.max_focal_change, _SIGMAS * float(np.hypot(a.offset_error, b.offset_error))):
+            alarms.append(_told(a.frames[0], b.frames[1], f"changes by {100 * abs(np.expm1(change)):.0f} %"))
+    return tuple(alarms[:1])
+
+
+def _told(first: int, last: int, words: str) -> str:
+    return f"frames {first} to {last} fit best if the focal length {words}: a zoom, a wrong calibration, or a mover"
+
+
+def _uncertain(spread: Spread, settings: VerdictSettings) -> tuple[tuple[int, int], ...]:
+    """Stretches (first and last frame) across which the parts of the evidence disagree about the scale."""
+    found: list[tuple[int, int]] = []
+    for first, last in spread.link_frames[_scale_errors(spread) > settings.max_scale_error].tolist():
+        if found and first <= found[-1][1]:
+            found[-1] = (found[-1][0], last)
+        else:
+            found.append((first, last))
+    return tuple(found)
+
+
+def _in_words(spread: Spread, error: float, settings: VerdictSettings) -> str:
+    """What the estimate rests on, in plain words."""
+    quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
+    worst = int(np.argmax(quarters))
+    words = f"estimated error {error:.1f} % of the path: "
+    scale = float(_scale_errors(spread).max(initial=0.0))
+    if settings.scale_share * scale > float(np.linalg.norm(spread.error_percent)):
+        first, last = spread.link_frames[int(np.argmax(_scale_errors(spread)))].tolist()
+        return words + f"the scale between frames {first} and {last} is known to {100 * scale:.0f} % only"
+    if quarters[worst] > 2.0 * halves.max():
+        return words + f"{PARTS[worst]} quarter of the picture it differs by {quarters[worst]:.1f} %"
+    return words + f"{HALVES[int(np.argmax(halves))]} alone differs by {halves.max():.1f} %"
+
+
+def _number(value: float) -> float | None:
+    return round(float(value), 4) if np.isfinite(value) else None

@@ -1,0 +1,113 @@
+"""What labelling and improving will cost, measured on a sample."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from rendered_walk import write_walk
+
+from improvo.cli.main import main
+from improvo.cli.plan import duration, size, useful_workers
+from improvo.errors import InputError
+from improvo.labeling import plan as module
+from improvo.labeling.plan import LabelPlan, plan_labels
+from improvo.odometry.run_settings import LabelRunSettings, RunSettings
+
+ORB = ["--frontend", "orb", "--max-keypoints", "200", "--set", "labels.min_observations=6"]
+
+
+def plan_of(**changed: float) -> LabelPlan:
+    values = {
+        "recordings": 40, "frames": 8000, "longest_frames": 200, "sample_frames": 300, "frame_seconds": 0.1,
+        "recording_seconds": 2.0, "memory_mib": 400, "frame_bytes": 2048.0,
+    }  # fmt: skip
+    return LabelPlan(**{**values, **changed})
+
+
+def test_time_is_shared_by_workers_up_to_one_for_each_recording() -> None:
+    plan = plan_of()
+    assert plan.core_seconds == pytest.approx(880)
+    assert plan.seconds(1) == pytest.approx(880)
+    assert plan.seconds(4) == pytest.approx(220)
+    assert plan.seconds(40) == plan.seconds(1000) == pytest.approx(22)
+    assert plan_of(longest_frames=4000).seconds(40) == pytest.approx(402)  # one worker has the longest recording
+    assert plan.storage_mib == pytest.approx(15.625)
+    assert useful_workers(plan) == [1, 2, 4, 8, 16, 32, 64]
+    assert useful_workers(plan_of(recordings=1)) == [1]
+
+
+def test_a_plan_measures_a_sample_and_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    walks = [str(write_walk(tmp_path / name, frames=24, seed=seed)) for seed, name in enumerate(("attic", "hall"))]
+    (tmp_path / "empty").mkdir()
+    before = sorted(tmp_path.rglob("*"))
+    assert main(["label", "--plan", *walks, str(tmp_path / "empty"), *ORB, "--json"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert sorted(tmp_path.rglob("*")) == before
+    assert values["recordings"] == 3
+    assert values["frames"] == 72  # of the empty one nothing is known: as many as the others have
+    assert values["longest_frames"] == 24
+    assert values["sample_frames"] == 48
+    assert 0.001 < values["frame_seconds"] < 5
+    assert values["memory_mib"] > 50
+    assert values["frame_bytes"] > 100
+    hours = (values["frames"] * values["frame_seconds"] + 3 * values["recording_seconds"]) / 3600
+    assert values["core_hours"] == pytest.approx(hours, abs=1e-4)
+    assert values["seconds_by_workers"]["2"] == pytest.approx(values["seconds_by_workers"]["1"] / 2, abs=0.1)
+
+
+def test_samples_are_short_and_of_a_few_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[tuple[str, int | None, bool]] = []
+
+    def here(work: object, jobs: list, on_result: object, on_ticks: object, workers: int) -> None:
+        for job in jobs:
+            done.append((job.path.name, job.settings.sequence.max_frames, job.pack))
+            on_result(job, InputError("dark"))
+
+    monkeypatch.setattr(module, "run_in_processes", here)
+    monkeypatch.setattr(module, "_lengths", lambda paths, settings: dict.fromkeys(paths, 1000))
+    with pytest.raises(InputError, match="no sample could be labelled; the first: dark"):
+        plan_labels([tmp_path / f"{n}" for n in range(9)], LabelRunSettings(), pack=True)
+    assert done == [("0", 150, True), ("4", 150, True), ("8", 150, True)]
+
+
+def test_recordings_that_cannot_be_opened_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty").mkdir()
+    assert main(["label", "--plan", str(tmp_path / "empty")]) == 2
+    assert "cannot be opened" in capsys.readouterr().err
+
+
+def test_without_a_plan_the_output_must_be_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty").mkdir()
+    for command in ("label", "improve"):
+        assert main([command, str(tmp_path / "empty")]) == 2
+        assert "-o" in capsys.readouterr().err
+
+
+def test_the_loop_labels_more_than_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured: list[str] = []
+
+    def plan(paths: list[Path], settings: RunSettings, **_: object) -> LabelPlan:
+        measured.append(Path(settings.frontend.name).name)
+        return plan_of(frames=1000, recordings=len(paths))
+
+    monkeypatch.setattr("improvo.improvement.plan.plan_labels", plan)
+    walk = str(write_walk(tmp_path / "attic", frames=4, seed=0))
+    assert main(["improve", "--plan", walk, "--rounds", "2", "--frontend", "superpoint-small", "--json"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert measured == ["superpoint-small.safetensors"]
+    assert values["labelings"] == pytest.approx(2.8)  # twice all, once more the four fifths that are trained on
+    assert values["labelling"]["core_hours"] == pytest.approx(2.8 * (1000 * 0.1 + 2.0) / 3600, abs=1e-3)
+    assert values["others"]["other_minutes"] > 0
+    assert [path.name for path in tmp_path.iterdir()] == ["attic"]
+
+
+def test_sizes_and_durations_read_well() -> None:
+    assert [duration(s) for s in (3.2, 130, 7300)] == ["3 s", "2 min", "2.0 h"]
+    assert [size(m) for m in (12.3, 2048, 3e6)] == ["12 MiB", "2.0 GiB", "2.9 TiB"]

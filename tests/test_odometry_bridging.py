@@ -1,0 +1,103 @@
+"""A camera that was lost and comes back: one world again, or two where it is another place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from simulated_features import CAMERA, error_percent, hand_motion, nothing_to_see, observe, room
+
+from improvo.odometry.result import OdometryResult
+from improvo.odometry.settings import BridgingSettings, OdometrySettings
+from improvo.odometry.significance import log10_false_alarms
+from improvo.odometry.states import TrackingState
+from improvo.odometry.visual_odometry import VisualOdometry
+from improvo.types import Features
+
+TRUTH = hand_motion(150, step=0.03)
+GAP = 12  # frames; more than the odometry waits for
+
+
+def run(features: list[Features], settings: OdometrySettings | None = None) -> VisualOdometry:
+    with VisualOdometry(lambda image: pytest.fail("no pictures here"), CAMERA, settings) as odometry:
+        for i, each in enumerate(features):
+            odometry.track_features(each, i / 30.0)
+    return odometry
+
+
+def with_a_gap(back: int) -> tuple[list[Features], list[int]]:
+    """Fifty frames, a gap, and fifty more from frame `back` on; and the true frame of each, -1 in the gap."""
+    frames = [*range(50), *([-1] * GAP), *range(back, back + 50)]
+    world = room()
+    return [nothing_to_see(i) if f < 0 else observe(world, TRUTH[f], seed=i) for i, f in enumerate(frames)], frames
+
+
+def test_a_camera_that_comes_back_goes_on_in_the_same_world_and_scale() -> None:
+    features, frames = with_a_gap(back=40)
+    odometry = run(features)
+    assert len(odometry.segments) == 1
+    segment = odometry.segments[0]
+    assert (segment.first, segment.last) == (0, len(features) - 1)
+    assert segment.frames == 100
+    trajectory = odometry.trajectory
+    posed = trajectory.valid
+    truth = TRUTH[[frame for frame, has_pose in zip(frames, posed, strict=True) if has_pose], :3, 3]
+    assert error_percent(trajectory.camera_centers[posed], truth) < 1.0
+    bridged = [event for event in odometry.events if event.kind == "bridged"]
+    assert len(bridged) == 1
+    assert "segment 0" in bridged[0].detail
+    assert segment.verdict.word == "right"
+    assert any("joined" in words for words in segment.verdict.evidence)
+    assert set(odometry.map.segment.tolist()) == {0}
+
+
+def test_without_bridging_it_begins_another_segment() -> None:
+    features, _ = with_a_gap(back=40)
+    odometry = run(features, replace(OdometrySettings(), bridging=BridgingSettings(max_frames=0)))
+    assert len(odometry.segments) == 2
+    assert not any(event.kind == "bridged" for event in odometry.events)
+
+
+def test_another_place_is_another_segment() -> None:
+    features, _ = with_a_gap(back=40)
+    other = [observe(room(9), pose, seed=700 + i) for i, pose in enumerate(hand_motion(50, step=0.03, seed=3))]
+    odometry = run([*features[: 50 + GAP], *other])
+    assert len(odometry.segments) == 2
+    assert odometry.segments[0].verdict.word == odometry.segments[1].verdict.word == "right"
+
+
+def test_the_state_is_provisional_until_the_joined_map_is_confirmed() -> None:
+    features, _ = with_a_gap(back=40)
+    with VisualOdometry(lambda image: pytest.fail("no pictures here"), CAMERA) as odometry:
+        tracked = [odometry.track_features(each, i / 30.0) for i, each in enumerate(features)]
+    after = [frame for frame in tracked if frame.frame_index >= 50 + GAP and frame.cam_from_world is not None]
+    assert {frame.state for frame in after} == {TrackingState.PROVISIONAL}
+    assert after[-1].segment == 0
+
+
+def test_two_runs_that_join_give_the_same_bytes() -> None:
+    features, _ = with_a_gap(back=40)
+    a, b = run(features), run(features)
+    assert a.trajectory.world_from_cam.tobytes() == b.trajectory.world_from_cam.tobytes()
+    assert [segment.verdict for segment in a.segments] == [segment.verdict for segment in b.segments]
+
+
+def test_a_segment_with_final_views_is_not_joined() -> None:
+    result = OdometryResult(CAMERA)
+    result._frame_indices.append(0)
+    with pytest.raises(RuntimeError, match="final views"):
+        result.join(0, result.placement, 0.01)
+
+
+class TestSignificance:
+    def test_what_chance_gives_is_no_pose(self) -> None:
+        assert log10_false_alarms(5, 100, 3.0, CAMERA) > -1.0
+        assert log10_false_alarms(3, 3, 3.0, CAMERA) == np.inf
+
+    def test_more_inliers_mean_more_and_more_matches_or_a_wider_threshold_less(self) -> None:
+        base = log10_false_alarms(15, 100, 3.0, CAMERA)
+        assert base < -6.0
+        assert log10_false_alarms(20, 100, 3.0, CAMERA) < base
+        assert log10_false_alarms(15, 300, 3.0, CAMERA) > base
+        assert log10_false_alarms(15, 100, 6.0, CAMERA) > base

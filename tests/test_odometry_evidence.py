@@ -1,0 +1,142 @@
+"""The jackknife over picture and points: noise, something carried, and a scale that nothing determines."""
+
+from __future__ import annotations
+
+import numpy as np
+from simulated_features import CAMERA, hand_motion, room
+
+from improvo.backend.settings import ObjectiveSettings
+from improvo.geometry import se3
+from improvo.odometry.evidence import PARTS, EvidenceCheck, Spread, error_percent
+from improvo.odometry.settings import VerdictSettings
+from improvo.odometry.verdict import DOUBTFUL, RIGHT, judge
+from improvo.odometry.view import View
+from improvo.types import Float64
+
+KEYFRAMES = 30
+TRUTH = se3.inverse(hand_motion(KEYFRAMES, step=0.08, turn_deg=0.8))
+SETTINGS = VerdictSettings()
+
+
+def spread_of(
+    cam_from_world: Float64,
+    xyz: Float64,
+    noise: float = 0.3,
+    kept: int = 250,
+    seen: np.ndarray | None = None,
+    shift: Float64 | None = None,
+) -> Spread:
+    """The spread of a path over points that are where the map says, seen with noise.
+
+    Args:
+        seen: (N, P) whether a point may be seen by a keyframe; None: all.
+        shift: (N, 2) pixels that what lies in the upper left quarter is off by.
+    """
+    check = EvidenceCheck(CAMERA, SETTINGS, ObjectiveSettings(depth_weight=0.0))
+    rng = np.random.default_rng(0)
+    for i, pose in enumerate(cam_from_world):
+        in_camera = se3.transform(pose, xyz)
+        pixels = CAMERA.project(in_camera)
+        inside = (pixels > 0).all(axis=1) & (pixels < (CAMERA.width, CAMERA.height)).all(axis=1)
+        rows = np.flatnonzero((in_camera[:, 2] > 0.1) & inside & (True if seen is None else seen[i]))[:kept]
+        keypoints = pixels[rows] + rng.normal(scale=noise, size=(len(rows), 2))
+        if shift is not None:
+            keypoints[(keypoints < (CAMERA.width / 2, CAMERA.height / 2)).all(axis=1)] += shift[i]
+        count = len(rows)
+        view = View(
+            i,
+            i / 30.0,
+            keypoints,
+            np.zeros((count, 1), np.float32),
+            np.ones(count),
+            np.arange(count),
+            rows,
+            keyframe=True,
+        )
+        check.add(view, pose, xyz)
+    spread = check.finish(xyz)
+    assert spread is not None
+    return spread
+
+
+def test_parts_of_good_evidence_agree() -> None:
+    spread = spread_of(TRUTH, room().points)
+    assert spread.keyframes == KEYFRAMES
+    assert spread.error_percent.shape == (len(PARTS),)
+    assert spread.error_percent.max() < 0.5
+    assert np.abs(spread.scale_steps).max() < 0.03
+    assert 0.25 < spread.noise_px < 0.35
+    verdict = judge(spread, SETTINGS)
+    assert verdict.word == RIGHT
+    assert verdict.error_percent < 2.0
+    assert verdict.uncertain == ()
+
+
+def test_more_noise_and_fewer_points_spread_the_paths() -> None:
+    good, noisy, few = (spread_of(TRUTH, room().points, *each) for each in ((0.3, 250), (2.0, 250), (0.3, 25)))
+    assert noisy.error_percent.mean() > 3.0 * good.error_percent.mean()
+    assert few.error_percent.mean() > 2.0 * good.error_percent.mean()
+    assert 1.7 < noisy.noise_px < 2.3
+
+
+def test_a_quarter_of_the_picture_that_says_otherwise_spreads_the_paths_that_have_it() -> None:
+    drift = np.linspace(0.0, 8.0, KEYFRAMES)[:, None] * (1.0, 0.0)
+    right, spread = spread_of(TRUTH, room().points), spread_of(TRUTH, room().points, shift=drift)
+    assert spread.error_percent.argmin() == 0  # without the upper left
+    assert spread.error_percent[1:].min() > 2.0 * spread.error_percent[0]
+    assert spread.error_percent.max() > 3.0 * right.error_percent.max()
+
+
+def two_scales(shared: int) -> tuple[Float64, Float64, np.ndarray]:
+    """A map whose second half is half as large again; so many points are seen on both sides of the change.
+
+    Returns:
+        cam_from_world (N, 4, 4), points (P, 3), and which keyframe may see which (N, P).
+    """
+    cut = KEYFRAMES // 2
+    centre = se3.inverse(TRUTH[cut])[:3, 3]
+    first, second = room(1).points[:1500], room(2).points[:1500]
+    cam_from_world = TRUTH.copy()
+    centers = centre + 1.5 * (se3.inverse(TRUTH[cut:])[:, :3, 3] - centre)
+    cam_from_world[cut:, :3, 3] = -np.einsum("nij,nj->ni", TRUTH[cut:, :3, :3], centers)
+    both = se3.transform(se3.inverse(TRUTH[cut]), np.array([[0.3 * i - 0.6, 0.1 * i, 4.0] for i in range(shared)]))
+    xyz = np.concatenate([first, centre + 1.5 * (second - centre), both.reshape(-1, 3)])
+    before = np.arange(KEYFRAMES)[:, None] < cut
+    point = np.arange(len(xyz))[None]
+    return cam_from_world, xyz, np.where(point < 1500, before, np.where(point < 3000, ~before, True))
+
+
+def test_a_scale_that_few_points_carry_on_is_marked_and_not_smoothed_over() -> None:
+    cam_from_world, xyz, seen = two_scales(shared=5)
+    verdict = judge(spread_of(cam_from_world, xyz, seen=seen), SETTINGS)
+    assert len(verdict.uncertain) == 1
+    first, last = verdict.uncertain[0]
+    assert first < KEYFRAMES // 2 <= last
+    assert verdict.error_percent > 4.0
+
+
+def test_parts_that_disagree_about_the_scale_make_a_segment_doubtful() -> None:
+    cam_from_world, xyz, seen = two_scales(shared=10)
+    verdict = judge(spread_of(cam_from_world, xyz, noise=1.5, seen=seen), SETTINGS)
+    assert verdict.word == DOUBTFUL
+    assert any("the scale" in words for words in verdict.evidence)
+
+
+def test_three_keyframes_are_the_least_and_two_are_not_judged() -> None:
+    xyz = room().points
+    assert np.isfinite(spread_of(TRUTH[:3], xyz).error_percent).all()
+    check = EvidenceCheck(CAMERA, SETTINGS, ObjectiveSettings(depth_weight=0.0))
+    assert check.finish(xyz) is None
+
+
+def test_the_same_evidence_gives_the_same_bytes() -> None:
+    a, b = (spread_of(TRUTH, room().points) for _ in range(2))
+    assert a.error_percent.tobytes() == b.error_percent.tobytes()
+    assert a.scale_steps.tobytes() == b.scale_steps.tobytes()
+
+
+def test_a_path_that_is_another_only_in_place_and_scale_has_no_error() -> None:
+    path = se3.inverse(TRUTH)[:, :3, 3]
+    assert error_percent(3.0 * path + (1.0, 2.0, 3.0), path) < 1e-9
+    bent = path + np.linspace(0.0, 1.0, KEYFRAMES)[:, None] ** 2 * (0.0, 1.0, 0.0)
+    assert error_percent(bent, path) > 0.5
