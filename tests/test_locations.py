@@ -24,14 +24,15 @@ from improvo.files import write_text
 from improvo.frontend.settings import FrontendSettings
 from improvo.labeling.label_sequences import LabelJob, label_sequence
 from improvo.labeling.labeled import read_labels
-from improvo.locations import fetched, is_remote, local_folder, publish, with_urls
+from improvo.locations import fetched, is_remote, local_folder, place, publish, with_urls
 from improvo.odometry.run_settings import LabelRunSettings
-from improvo.stability.settings import LabelSettings
+from improvo.stability.settings import LabelQualitySettings, LabelSettings
 from labeled_scene import write_labeled_scene
 
 fsspec = pytest.importorskip("fsspec", reason="locations need the extra `remote`")
 
-ORB = ["--frontend", "orb", "--max-keypoints", "200", "--set", "labels.min_observations=6", "--pack"]
+ORB = ["--frontend", "orb", "--max-keypoints", "200", "--set", "labels.min_observations=6"]
+ORB += ["--set", "labels.quality.enabled=false", "--pack"]
 BUCKET = "improvo-test"
 
 
@@ -39,7 +40,7 @@ BUCKET = "improvo-test"
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder for what stands for locations, and no waiting between tries."""
     monkeypatch.setenv("IMPROVO_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(locations, "_WAITS", (0.0, 0.0))
+    monkeypatch.setattr(place, "_WAITS", (0.0, 0.0))
     locations._places.clear()
     yield tmp_path / "cache"
     locations._places.clear()
@@ -220,7 +221,9 @@ def test_a_worker_on_another_machine_labels_into_the_location(memory: str, tmp_p
     walk = write_walk(tmp_path / "attic", frames=16, seed=0)
     elsewhere = tmp_path / "no" / "such" / "folder"
     network = FrontendSettings(name="orb", max_keypoints=200)
-    settings = LabelRunSettings(frontend=network, labels=LabelSettings(min_observations=6))
+    settings = LabelRunSettings(
+        frontend=network, labels=LabelSettings(min_observations=6, quality=LabelQualitySettings(enabled=False))
+    )
     record = label_sequence(LabelJob("attic", walk, elsewhere, settings, False, memory), lambda: None)
     assert record.tracked > 10
     assert {"attic/label.json", "attic/tracks.parquet"} <= names(memory)
@@ -248,21 +251,21 @@ class Failing:
 
 def test_a_fault_that_passes_is_tried_again(memory: str) -> None:
     folder = local_folder(memory)
-    place = locations._places[folder]
-    place._fs = Failing(place.fs, "put_file", 2, TimeoutError("slow"))
+    opened = locations._places[folder]
+    opened._fs = Failing(opened.fs, "put_file", 2, TimeoutError("slow"))
     write_text(folder / "a.txt", "one")
     assert names(memory) == {"a.txt"}
-    assert place._fs.left == 0
+    assert opened._fs.left == 0
 
 
 def test_a_full_bucket_is_one_line_and_a_second_start_goes_on(memory: str) -> None:
     folder = local_folder(memory)
-    place = locations._places[folder]
-    place._fs = Failing(place.fs, "put_file", 1000, OSError("QuotaExceeded:\n no room"))
+    opened = locations._places[folder]
+    opened._fs = Failing(opened.fs, "put_file", 1000, OSError("QuotaExceeded:\n no room"))
     words = rf"{memory}: cannot be written \(QuotaExceeded: no room\); what is done is kept in .*; run again to go on"
     with pytest.raises(OutputError, match=words):
         write_text(folder / "a.txt", "one")
-    assert place._fs.left == 997
+    assert opened._fs.left == 997
     locations._places.clear()
     again = local_folder(memory)
     assert (again / "a.txt").read_text() == "one"

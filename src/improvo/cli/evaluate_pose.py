@@ -128,11 +128,14 @@ def read_results(path: Path) -> dict[str, Any]:
     Raises:
         InputError: not such a file.
     """
+    from improvo.evaluation.pose.tables import check_results
+
     try:
         results = read_json_file(path, "evaluate again")
-        if results["protocol"] != "pose" or not isinstance(results["rows"], list) or not results["rows"]:
+        if results["protocol"] != "pose" or not results["rows"]:
             raise KeyError
-    except (OSError, KeyError, InputError):
+        check_results(results)
+    except (OSError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError, InputError):
         raise InputError(f"{path}: is no pose.json of `improvo evaluate pose`; check the path") from None
     return results
 

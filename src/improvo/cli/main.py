@@ -20,6 +20,8 @@ _EPILOG = """\
 `improvo VERB --help` shows a command's options with their defaults.
 Exit status: 0 done, 2 an error that you can correct (one line says how), 3 done, but no frame has a pose,
 130 interrupted, 1 a bug of improvo."""
+_NO_MEMORY = "out of memory; give it more, or smaller pictures (--width), fewer keypoints or fewer --workers"
+_WORDS_OF_NO_MEMORY = ("insufficient memory", "can't allocate memory", "out of memory", "bad_alloc", "start new thread")
 
 
 class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
@@ -65,6 +67,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except Exception as error:
+        if not _out_of_memory(error):
+            raise
+        print(f"improvo: {_NO_MEMORY}", file=sys.stderr)
+        return 2
+
+
+def _out_of_memory(error: Exception) -> bool:
+    """Whether this is how Python, NumPy, OpenCV, torch or OpenVINO say so."""
+    return isinstance(error, MemoryError) or any(words in str(error).lower() for words in _WORDS_OF_NO_MEMORY)
 
 
 def _check_paths(arguments: argparse.Namespace) -> None:

@@ -87,15 +87,19 @@ def joined(first: Verdict, second: Verdict, scale_error: float) -> Verdict:
 def estimated_error(spread: Spread, settings: VerdictSettings) -> float:
     """Error of the segment's positions after Sim3, % of its path.
 
-    The root sum of squares of what the parts' paths differ by, and of what the least certain change of scale moves.
+    The root sum of squares of what the paths of the parts differ by, and of what the least certain change of scale
+    moves. Of the two halves of the points the better one counts twice: the other can have too few by chance. Unusual
+    noise is worse than its spread: what does not fit is dropped, so what stays agrees with what is wrong.
     """
+    noise = np.nan_to_num(spread.noise_px) / (settings.usual_noise * spread.width)
+    quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
     scale = settings.scale_share * float(_scale_errors(spread).max(initial=0.0))
-    return float(np.hypot(np.linalg.norm(spread.error_percent), scale))
+    return float(max(noise, 1.0) * np.sqrt((quarters**2).sum() + len(HALVES) * halves.min() ** 2 + scale**2))
 
 
 def _scale_errors(spread: Spread) -> Float64:
-    """(L,) disagreement of the parts about the change of scale across each link, standard deviation of its log."""
-    return np.asarray(np.sqrt((spread.scale_steps**2).mean(axis=1)), np.float64)
+    """(L,) how much the parts change the scale across each link, median of the absolute logarithms."""
+    return np.asarray(np.median(np.abs(spread.scale_steps), axis=1), np.float64)
 
 
 def _lens_alarms(spread: Spread, settings: VerdictSettings) -> tuple[str, ...]:
@@ -141,6 +145,8 @@ def _in_words(spread: Spread, error: float, settings: VerdictSettings) -> str:
     quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
     worst = int(np.argmax(quarters))
     words = f"estimated error {error:.1f} % of the path: "
+    if spread.noise_px > 1.5 * settings.usual_noise * spread.width:
+        words += f"the points are {spread.noise_px:.1f} pixels off, and "
     scale = float(_scale_errors(spread).max(initial=0.0))
     if settings.scale_share * scale > float(np.linalg.norm(spread.error_percent)):
         first, last = spread.link_frames[int(np.argmax(_scale_errors(spread)))].tolist()
