@@ -8,7 +8,10 @@ First table: share of the pixels with a depth, relative error (median, share ove
 recording and under one for each frame, time of a frame, and that time as a multiple of SIFT's on the same frame. Second
 table, frames so far apart, at pixels where both maps agree to 5 %: distance to where the depth image and the true poses
 put the pixel (median, share over 8 px), and at SIFT matches the median distance of the match from the correspondence of
-the maps and from that of the truth. SIFT knows neither: the smaller distance is the better correspondence.
+the maps and from that of the truth. SIFT knows neither: the smaller distance is the better correspondence. Third table,
+with `--aligned` (needs torch): at corners that both maps show, how many the pictures confirm and contradict when
+patches are laid over each other, how far the maps and the truth put them from where the pictures agree, and distance
+to the truth before and after they are moved there.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from depth_alignment import aligned_correspondences
 from depth_cases import Case, cases
 from depth_measures import Maps, accuracy, correspondences
 from improvo import config
@@ -69,6 +73,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="at most so many of each recording")
     parser.add_argument("--every", type=int, default=10, help="pairs start at every n-th frame")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a setting of depth")
+    parser.add_argument("--aligned", action="store_true", help="also what the pictures make of the correspondences")
     parser.add_argument("--runs", type=Path, help="keep rendered rooms and runs here, and use them again")
     arguments = parser.parse_args()
     settings = config.load(DepthSettings, overrides=arguments.set)
@@ -79,7 +84,7 @@ def main() -> None:
         runs.mkdir(parents=True, exist_ok=True)
         print("| recording/poses | frames | known | median, % | over 5 % | per frame | over 5 % | ms | x SIFT |")
         print("|---|---|---|---|---|---|---|---|---|")
-        rows = []
+        rows, moved = [], []
         for case in cases(arguments.cases, runs, arguments.frames):
             maps, seconds, sift_seconds = swept(case, settings)
             a = accuracy(case, maps)
@@ -91,6 +96,8 @@ def main() -> None:
             )
             every = 1 if case.gaps[0] == 1 else arguments.every
             rows += [(case.name, found) for gap in case.gaps if (found := correspondences(case, maps, gap, every))]
+            gaps = case.gaps if arguments.aligned else ()
+            moved += [(case.name, found) for gap in gaps if (found := aligned_correspondences(case, maps, gap, every))]
     print()
     print("| recording/poses | frames apart | pixels | median, px | over 8 px | matches | own, px | truth, px |")
     print("|---|---|---|---|---|---|---|---|")
@@ -98,6 +105,16 @@ def main() -> None:
         print(
             f"| `{name}` | {c.gap} | {c.pixels:.3f} | {c.median:.2f} | {c.far_off:.3f} | {c.matches} | "
             f"{c.own_to_match:.2f} | {c.truth_to_match:.2f} |"
+        )
+    if moved:
+        print()
+        print("| recording/poses | apart | seen | confirmed | elsewhere | own, px | truth, px | to truth | over 8 px |")
+        print("|---|---|---|---|---|---|---|---|---|")
+    for name, m in moved:
+        print(
+            f"| `{name}` | {m.gap} | {m.visible:.3f} | {m.certain:.3f} | {m.contradicted:.3f} | "
+            f"{m.own_to_picture:.2f} | {m.truth_to_picture:.2f} | {m.before:.2f} -> {m.after:.2f} | "
+            f"{m.far_before:.3f} -> {m.far_after:.3f} |"
         )
 
 

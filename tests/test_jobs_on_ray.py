@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
+import signal
 import socket
 import sys
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +18,7 @@ from rendered_walk import write_walk
 
 from improvo.cli.main import main
 from improvo.errors import InputError, MissingExtraError
-from improvo.jobs.on_ray import run_on_ray
+from improvo.jobs.on_ray import gpus_of, run_on_ray
 from improvo.jobs.processes import Tick
 from improvo.jobs.workers import WorkerDiedError
 
@@ -92,6 +96,7 @@ def test_labels_are_those_of_one_process(cluster, tmp_path, monkeypatch, capsys)
     monkeypatch.chdir(tmp_path)
     walks = [write_walk(Path(name), frames=16, seed=seed) for seed, name in enumerate(("kitchen", "hall"))]
     options = ["--frontend", "orb", "--max-keypoints", "200", "--set", "labels.min_observations=6"]
+    options += ["--set", "labels.quality.enabled=false"]
     here = ["label", *map(str, walks), "nowhere", *options]
     assert main([*here, "-o", "here"]) == 0
     assert main([*here, "-o", "there", "--ray", "local"]) == 0  # relative paths
@@ -99,6 +104,60 @@ def test_labels_are_those_of_one_process(cluster, tmp_path, monkeypatch, capsys)
     for name in ("tracks.parquet", "points.parquet", "frames.parquet", "trajectory.txt"):
         for walk in ("kitchen", "hall"):
             assert (tmp_path / "there" / walk / name).read_bytes() == (tmp_path / "here" / walk / name).read_bytes()
+
+
+def test_a_worker_that_is_killed_in_the_middle_changes_nothing(cluster, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    walks = [write_walk(Path(name), frames=40, seed=seed) for seed, name in enumerate(("kitchen", "hall"))]
+    words = ["label", *map(str, walks), "--frontend", "orb", "--max-keypoints", "200"]
+    words += ["--set", "labels.min_observations=6", "--set", "labels.quality.enabled=false"]
+    assert main([*words, "-o", "here"]) == 0
+    killed: list[int] = []
+
+    def kill() -> None:
+        ends = time.monotonic() + 300
+        while not killed and time.monotonic() < ends:
+            for lock in Path(tmp_path, "there").glob(".*.lock"):
+                name = lock.name.removeprefix(".").removesuffix(".lock")
+                started = list(Path(tmp_path, "there", f".{name}.partial").glob(".tracks*"))
+                with contextlib.suppress(OSError, ValueError):
+                    process = json.loads(lock.read_text())["process"]
+                    if started and process != os.getpid():
+                        os.kill(process, signal.SIGKILL)
+                        killed.append(process)
+                        return
+            time.sleep(0.005)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    assert main([*words, "-o", "there", "--ray", "local", "--workers", "2"]) == 0
+    killer.join()
+    assert len(killed) == 1
+    assert "2 of 2 sequences labelled" in capsys.readouterr().out
+    for name in ("tracks.parquet", "points.parquet", "frames.parquet", "trajectory.txt"):
+        for walk in ("kitchen", "hall"):
+            assert (tmp_path / "there" / walk / name).read_bytes() == (tmp_path / "here" / walk / name).read_bytes()
+
+
+def test_a_loop_on_the_cluster_keeps_what_the_local_one_keeps(cluster, tmp_path):
+    pytest.importorskip("torch", reason="training needs the extra `train`")
+    from improvement_example import FakeTraining
+    from improvement_example import run as improve
+    from test_improvement_loop import results as outcome
+
+    walks = [write_walk(tmp_path / name, frames=30, seed=seed) for seed, name in enumerate(("kitchen", "hall"), 3)]
+    here = improve(tmp_path / "here", walks, FakeTraining(), rounds=1)
+    there = improve(tmp_path / "there", walks, FakeTraining(), rounds=1, ray="local", workers=2)
+    assert here.best == there.best
+    expected, found = outcome(tmp_path / "here"), outcome(tmp_path / "there")
+    assert found.keys() == expected.keys()
+    assert [name for name in found if found[name] != expected[name]] == []
+
+
+def test_gpus_that_are_not_there_are_said(cluster):
+    assert gpus_of("local") == 0
+    with pytest.raises(InputError, match="no node with a GPU"):
+        run_on_ray(halve, [2], lambda job, result: None, lambda count: None, "local", gpus=1)
 
 
 def test_no_ray_and_no_cluster_are_one_line_errors(monkeypatch):

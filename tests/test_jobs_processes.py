@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from improvo.errors import ImprovoError, MissingExtraError
+from improvo.jobs.crew import TRIES, Crew
 from improvo.jobs.processes import Tick, run_here, run_in_processes
 from improvo.jobs.workers import WorkerDiedError
 
@@ -26,6 +27,14 @@ def halve(number: int, tick: Tick) -> tuple[int, str | None]:
 
 def die(number: int, tick: Tick) -> int:
     os._exit(1)
+
+
+def die_twice(folder: Path, tick: Tick) -> int:
+    tries = len(list(folder.iterdir()))
+    if tries < 2:
+        (folder / str(tries)).touch()
+        os._exit(1)
+    return tries
 
 
 def count_until_stopped(number: int, tick: Tick) -> str:
@@ -102,6 +111,7 @@ PARENT = """
 import sys
 from test_jobs_processes import last_for_minutes
 from improvo.jobs.pool import Workers
+from improvo.jobs.crew import TRIES, Crew
 from improvo.jobs.processes import run_in_processes
 if __name__ == "__main__":
     if sys.argv[1] == "processes":
@@ -138,3 +148,23 @@ def test_workers_end_when_their_parent_is_killed(kind, tmp_path):
     while any(alive(worker) for worker in workers) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not any(alive(worker) for worker in workers)
+
+
+def test_a_crew_gives_results_in_order_and_the_first_error():
+    ticks = []
+    assert [number for number, _ in Crew().results(halve, [8, 2, 4], ticks.append)] == [4, 1, 2]
+    assert sum(ticks) == 14
+    assert Crew(2).results(halve, [6, 2]) == [(3, "1"), (1, "1")]
+    with pytest.raises(ValueError, match="3 is odd"):
+        Crew().results(halve, [2, 3, 5])
+    assert Crew().results(halve, []) == []
+
+
+def test_a_job_whose_worker_dies_is_done_again_and_then_set_aside(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    assert Crew(2).results(die_twice, [tmp_path / "a", tmp_path / "b"]) == [2, 2]
+    results = {}
+    Crew(2).do(die, [1, 2], results.__setitem__, lambda count: None)
+    assert {type(result) for result in results.values()} == {WorkerDiedError}
+    assert TRIES == 3

@@ -14,6 +14,7 @@ from improvo.continuation import SettingsRecord
 from improvo.errors import ConfigError
 from improvo.files import check_output_folder, make_output_folder
 from improvo.improvement.settings import ImproveSettings
+from improvo.locations import removed
 
 COMMAND = "improve"
 # settings of the optimiser that may differ when a run is continued: none of these alters a result
@@ -167,6 +168,7 @@ class ImproveFolder:
         elif record.difference(values):  # nothing has come of it yet
             for folder in (self.reference, self.start.folder):
                 shutil.rmtree(folder, ignore_errors=True)
+                removed(folder)
         make_output_folder(self.folder, COMMAND)
         record.write(values)
         for leftover in list(self.folder.rglob(".*.partial*")):  # of a killed run; some lie in others

@@ -20,6 +20,7 @@ from improvo.frontend.weights import load_weights, save_weights
 from improvo.improvement.earlier import earlier_runs
 from improvo.improvement.estimate import refuse_full_disk
 from improvo.improvement.folder import COMMAND, Candidate, ImproveFolder
+from improvo.improvement.plan import first_estimate
 from improvo.improvement.progress import ImprovementProgress
 from improvo.improvement.recipe import Train, TrainingJob
 from improvo.improvement.reference import HELD_BACK, TRAINING, ReferencePart
@@ -89,12 +90,13 @@ def improve(
     with locked(output):
         folder = ImproveFolder(output, sequences, evaluate, settings, first_weights, after)
         loop = Rounds(folder, settings, train or _train, data, workers, ray, progress)
+        needed = first_estimate(sequences, settings, rounds, evaluate)
+        if needed is not None:
+            progress.line(f"estimate: {needed.words}")
+            refuse_full_disk(output, needed)
         split = loop.split(sequences, evaluate, first_weights)
         progress.split(split)
         start = loop.start(first_weights, split.training)
-        needed = loop.estimate(start, split, rounds)
-        progress.line(f"estimate: {needed.words}")
-        refuse_full_disk(output, needed)
         teaching, judging = loop.reference(split)
         teaching += earlier.parts(TRAINING)
         judging += earlier.parts(HELD_BACK)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from improvo.improvement.reference import ReferencePart
 from improvo.improvement.settings import ValidationSettings
 from improvo.improvement.split import Part
 from improvo.improvement.validation import GapScores, Validation, write_validation
+from improvo.jobs.crew import Crew
 from improvo.jobs.pool import Workers
 from improvo.labeling.labeled import LabeledSequence, read_labels
 from improvo.labeling.store import DONE, SequenceRecord
@@ -39,8 +41,9 @@ def validate(
     reference: Sequence[ReferencePart],
     records: list[SequenceRecord],
     settings: ValidationSettings,
-    tick: Callable[[], None] = lambda: None,
+    tick: Callable[[int], None] = lambda count: None,
     progress: bool = False,
+    crew: Crew = Crew(),  # noqa: B008 - it is frozen
 ) -> Validation:
     """Measure a candidate and keep the result.
 
@@ -50,17 +53,16 @@ def validate(
         reference: the same for all candidates.
         records: of those labels.
         settings: of the validation.
-        tick: called after every pair of frames.
+        tick: is told that so many more pairs of frames are done.
         progress: whether the pose protocol shows a bar.
+        crew: who measures, a recording each.
 
     Raises:
         InputError: no pair of frames has poses and depth.
     """
-    from improvo.frontend.registry import load_frontend
-
     started = time.perf_counter()
-    frontend = load_frontend(str(candidate.weights), settings.matches.max_keypoints)
-    scores = [entry for one in reference for entry in _scores(one, frontend, settings, tick)]
+    jobs = [_ScoreJob(one, candidate.weights, settings) for one in reference]
+    scores = [entry for found in crew.results(_scores_of, jobs, tick) for entry in found]
     if all(entry.earlier for entry in scores):
         raise InputError(
             "what is held back has no pair of frames with poses and depth; hold back a longer or livelier recording "
@@ -91,6 +93,28 @@ def pairs_of(run: FixedRun, settings: ValidationSettings) -> list[Int64]:
     gaps = settings.gaps or choose_gaps(run, settings.overlaps, settings.min_pairs)
     chosen = [choose_pairs(run, gap, settings.matches.pairs) for gap in gaps]
     return [pairs for pairs in chosen if len(pairs)]
+
+
+@dataclass(frozen=True)
+class _ScoreJob:
+    """A recording to measure a frontend on."""
+
+    reference: ReferencePart
+    weights: Path
+    settings: ValidationSettings
+
+
+def _scores_of(job: _ScoreJob, tick: Callable[[], None]) -> list[GapScores]:
+    frontend = _loaded(job.weights, job.settings.matches.max_keypoints, job.weights.stat().st_mtime_ns)
+    return _scores(job.reference, frontend, job.settings, tick)
+
+
+@lru_cache(maxsize=1)
+def _loaded(weights: Path, max_keypoints: int, written: int) -> Frontend:
+    """The frontend of the recording before it, too; loading takes a second."""
+    from improvo.frontend.registry import load_frontend
+
+    return load_frontend(str(weights), max_keypoints)
 
 
 def _scores(

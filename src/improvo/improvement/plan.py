@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -52,6 +53,34 @@ def plan_improvement(
     pixels = _pixels(paths, settings)
     parameters = sum(tensor.size for tensor in load_weights(weights).tensors.values())
     return ImprovePlan(once, estimate(settings, rounds, once.frames - held_back, held_back, pixels, parameters))
+
+
+def first_estimate(
+    sequences: Sequence[Path], settings: ImproveSettings, rounds: int, evaluate: Sequence[Path] = ()
+) -> Estimate | None:
+    """What all of it takes, from the lengths of the recordings alone; nothing of what is done already is taken off.
+
+    Args:
+        sequences, settings, rounds, evaluate: see `improve`.
+
+    Returns:
+        None where no recording can be opened, which the loop itself will say.
+    """
+    named = {path.resolve() for path in evaluate}
+    training = held_back = 0
+    for path in dict.fromkeys([*sequences, *evaluate]):
+        with suppress(InputError):
+            frames = open_sequence(path, settings.sequence).length or 0
+            held_back += frames if path.resolve() in named else 0
+            training += 0 if path.resolve() in named else frames
+    if not evaluate:
+        held_back = round(training * settings.split.share)
+        training -= held_back
+    if training + held_back == 0:
+        return None
+    paths = [*sequences, *evaluate]
+    parameters = sum(tensor.size for tensor in load_weights(starting_weights(settings.frontend.name)).tensors.values())
+    return estimate(settings, rounds, training, held_back, _pixels(paths, settings), parameters)
 
 
 def _pixels(paths: Sequence[Path], settings: ImproveSettings) -> int:

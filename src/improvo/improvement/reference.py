@@ -108,6 +108,20 @@ def reference_parts(store: Path, part: Part, kind: str) -> list[ReferencePart]:
     return found
 
 
+@dataclass(frozen=True)
+class DepthJob:
+    """What `make_depth` does in a worker."""
+
+    part: ReferencePart
+    most: int
+    settings: ReferenceSettings
+
+
+def do_depth_job(job: DepthJob, tick: Callable[[], None]) -> None:
+    """Depth maps of a part."""
+    make_depth(job.part, job.most, job.settings, tick)
+
+
 def make_depth(
     part: ReferencePart, most: int, settings: ReferenceSettings, tick: Callable[[], None] = lambda: None
 ) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,8 +14,6 @@ import numpy as np
 
 from improvo.errors import ConfigError, InputError, OutputError
 from improvo.frontend.weights import find_weights, load_weights, save_weights
-from improvo.geometry.camera import Camera
-from improvo.improvement.estimate import Estimate, estimate
 from improvo.improvement.folder import Candidate, ImproveFolder
 from improvo.improvement.measuring import pairs_of, validate
 from improvo.improvement.progress import ImprovementProgress
@@ -23,8 +21,9 @@ from improvo.improvement.recipe import Train, TrainingJob
 from improvo.improvement.reference import (
     HELD_BACK,
     TRAINING,
+    DepthJob,
     ReferencePart,
-    make_depth,
+    do_depth_job,
     reference_parts,
     refuse_without_depth,
 )
@@ -39,6 +38,8 @@ from improvo.improvement.split import (
     split_whole_sequences,
 )
 from improvo.improvement.validation import Validation, read_validation
+from improvo.jobs.crew import Crew
+from improvo.jobs.on_ray import gpus_of
 from improvo.labeling.label_sequences import label_sequences
 from improvo.labeling.store import DONE, SequenceRecord, read_records
 from improvo.sequences import Sequence as ImageSequence
@@ -58,7 +59,7 @@ class Rounds:
         train: what trains.
         data: what the model card says about the recordings.
         workers: sequences that are labelled at a time.
-        ray: address of a Ray cluster that labels them, see `improvo.jobs.on_ray`.
+        ray: address of a Ray cluster that labels, measures and, where it has GPUs and this machine has none, trains.
         progress: is told progress and results.
     """
 
@@ -73,7 +74,7 @@ class Rounds:
         progress: ImprovementProgress,
     ) -> None:
         self._folder, self._settings, self._train = folder, settings, train
-        self._data, self._workers, self._ray, self._progress = data, workers, ray, progress
+        self._data, self._crew, self._progress = data, Crew(workers, ray), progress
 
     def split(self, sequences: Sequence[Path], evaluate: Sequence[Path], weights_file: Path) -> Split:
         """What is trained on and what is held back; several sequences are labelled first, to know which are of use.
@@ -108,14 +109,6 @@ class Rounds:
                 write_calibrated(weights_file, candidate.weights, calibration_images(part, self._images))
         return candidate
 
-    def estimate(self, start: Candidate, split: Split, rounds: int) -> Estimate:
-        """Roughly what all of it takes; nothing of what is done already is taken off."""
-        parts = split.training, split.held_back
-        training, held_back = (sum(_length(path, part.sequence) for path in part.paths) for part in parts)
-        camera = _camera(parts[0])
-        parameters = sum(tensor.size for tensor in load_weights(start.weights).tensors.values())
-        return estimate(self._settings, rounds, training, held_back, camera.width * camera.height, parameters)
-
     def reference(self, split: Split) -> tuple[list[ReferencePart], list[ReferencePart]]:
         """The fixed run over all frames, with depth of either part from its own frames: training, held back.
 
@@ -135,9 +128,9 @@ class Rounds:
         ):
             parts = reference_parts(store, part, kind)
             missing = [one for one in parts if not one.depth_file.is_file()]
+            jobs = [DepthJob(one, max(most // len(parts), 2), settings) for one in missing]
             with self._progress.bar(f"depth of the reference, {kind}", "frame") as tick:
-                for one in missing:
-                    make_depth(one, max(most // len(parts), 2), settings, tick)
+                self._crew.results(do_depth_job, jobs, tick)
             found.append(parts)
         mend = "record with a moving camera, or hold back other recordings with --evaluate"
         refuse_without_depth(found[0], "the training part", mend)
@@ -190,9 +183,23 @@ class Rounds:
             data=self._data,
             progress=self._progress.shown,
         )
-        self._train(job)
+        if self._trains_there():
+            with self._progress.bar("training on the cluster", "step") as tick:
+                self._crew.results(_TrainThere(self._train), [replace(job, progress=False)], tick, gpus=1)
+        else:
+            self._train(job)
         images = calibration_images(part, self._images)
         write_calibrated(candidate.training / "weights.safetensors", candidate.weights, images)
+
+    def _trains_there(self) -> bool:
+        """Whether the GPU is on the cluster, and not here."""
+        settings = self._settings
+        device = (settings.held if settings.recipe == HELD else settings.training).optimiser.device
+        if self._crew.ray is None or device == "cpu":
+            return False
+        import torch
+
+        return not torch.cuda.is_available() and gpus_of(self._crew.ray) > 0
 
     def validate(self, candidate: Candidate, part: Part, reference: Sequence[ReferencePart]) -> Validation:
         """How good a candidate is on what was held back."""
@@ -208,7 +215,7 @@ class Rounds:
         settings = self._settings.validation
         pairs = sum(len(pairs) for one in reference for pairs in pairs_of(one.fixed_run(), settings))
         with self._progress.bar(f"{candidate.name}, matches against the reference", "pair", pairs) as tick:
-            return validate(candidate, part, reference, records, settings, tick, self._progress.shown)
+            return validate(candidate, part, reference, records, settings, tick, self._progress.shown, self._crew)
 
     def _share(self, candidate: Candidate, part: Part, store: Path) -> None:
         """Whole recordings were labelled by the start for the reference already."""
@@ -241,20 +248,22 @@ class Rounds:
                 paths,
                 store,
                 self._settings.run_settings(how, frontend),
-                workers=self._workers,
-                ray=self._ray,
+                workers=self._crew.workers,
+                ray=self._crew.ray,
                 on_record=lambda record: self._progress.labeled(what, record),
                 on_frames=tick,
             )
         return _refuse_unwritten(records)
 
 
-def _camera(part: Part) -> Camera:
-    """Of the first recording that can be opened."""
-    for path in part.paths[:-1]:
-        with suppress(InputError):
-            return open_sequence(path, part.sequence).camera
-    return open_sequence(part.paths[-1], part.sequence).camera
+@dataclass(frozen=True)
+class _TrainThere:
+    """Training as a job."""
+
+    train: Train
+
+    def __call__(self, job: TrainingJob, tick: Callable[[], None]) -> None:
+        self.train(job)
 
 
 def _length(path: Path, how: SequenceSettings) -> int:

@@ -29,6 +29,7 @@ def run_on_ray(
     on_ticks: Callable[[int], None],
     address: str,
     workers: int | None = None,
+    gpus: int = 0,
 ) -> None:
     """As `run_in_processes`, on a Ray cluster, one core and one BLAS thread for each job.
 
@@ -42,20 +43,21 @@ def run_on_ray(
         on_ticks: is told that so many more ticks have come.
         address: of the cluster (`host:6379`, `auto`, `ray://host:10001`), or `local` to start one on this machine.
         workers: jobs at a time, at most; as many as the cluster has cores for if None.
+        gpus: that each job has to itself.
 
     Raises:
         MissingExtraError: Ray is not installed.
-        InputError: there is no cluster at the address.
+        InputError: there is no cluster at the address, or it has fewer GPUs.
     """
-    try:
-        import ray
-    except ImportError:
-        raise MissingExtraError("work on a Ray cluster", "ray") from None
+    ray = _imported()
 
     with _connected(ray, address):
+        resources = ray.cluster_resources()
+        if resources.get("GPU", 0) < gpus:
+            raise InputError(f"the Ray cluster at {address} has no node with a GPU; ask for the CPU instead")
         counter = ray.remote(num_cpus=0)(_Counter).remote()
-        task = ray.remote(num_cpus=1, max_retries=0)(_work)
-        most = workers or _WAITING_PER_CORE * max(int(ray.cluster_resources().get("CPU", 1)), 1)
+        task = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=0)(_work)
+        most = workers or _WAITING_PER_CORE * max(int(resources.get("CPU", 1)), 1)
         waiting, told = deque(jobs), 0
         running: dict[Any, Job] = {}
         try:
@@ -74,6 +76,25 @@ def run_on_ray(
             if running:
                 ray.wait(list(running), num_returns=len(running), timeout=_CANCEL_SECONDS)
             raise
+
+
+def gpus_of(address: str) -> int:
+    """How many GPUs a cluster has.
+
+    Raises:
+        MissingExtraError, InputError: see `run_on_ray`.
+    """
+    ray = _imported()
+    with _connected(ray, address):
+        return int(ray.cluster_resources().get("GPU", 0))
+
+
+def _imported() -> Any:
+    try:
+        import ray
+    except ImportError:
+        raise MissingExtraError("work on a Ray cluster", "ray") from None
+    return ray
 
 
 class _Counter:

@@ -15,8 +15,8 @@ import numpy as np
 from improvo.config import to_dict
 from improvo.errors import ImprovoError, InputError, OutputError
 from improvo.folder_lock import BusyError, claimed, seems_held
-from improvo.jobs.on_ray import run_on_ray
-from improvo.jobs.processes import Tick, run_here, run_in_processes
+from improvo.jobs.crew import Crew
+from improvo.jobs.processes import Tick
 from improvo.labeling.frames import FRAMES_FILE, FramesTable, pack_images, write_frames
 from improvo.labeling.labeler import run_and_label
 from improvo.labeling.store import (
@@ -29,6 +29,7 @@ from improvo.labeling.store import (
     lock_of,
     sequence_names,
 )
+from improvo.locations import folder_here, refresh, url_of
 from improvo.odometry.run_settings import RunSettings
 
 logger = logging.getLogger(__name__)
@@ -45,6 +46,7 @@ class LabelJob:
     store: Path
     settings: RunSettings
     pack: bool
+    url: str = ""  # of the store, where it is at a location
 
     @property
     def folder(self) -> Path:
@@ -102,7 +104,10 @@ def label_sequences(
         if record.path != str(names[name]):
             raise InputError(f"{names[name]}: the store has another recording named {name}; rename one of them")
         on_record(record)
-    jobs = [LabelJob(name, path, store.folder, settings, pack) for name, path in names.items() if name not in before]
+    url = url_of(store.folder)
+    jobs = [
+        LabelJob(name, path, store.folder, settings, pack, url) for name, path in names.items() if name not in before
+    ]
 
     def run(jobs: Sequence[LabelJob]) -> list[LabelJob]:
         """Do them; returns those that somebody else works on."""
@@ -116,17 +121,16 @@ def label_sequences(
             records[job.name] = _stored(store, job, result)
             on_record(records[job.name])
 
-        if ray is not None:
-            run_on_ray(label_sequence, jobs, on_result, on_frames, ray, workers)
-        elif len(jobs) == 1 or (workers or 1) <= 1:
-            run_here(label_sequence, jobs, on_result, on_frames)
-        else:
-            run_in_processes(label_sequence, jobs, on_result, on_frames, min(workers or 1, len(jobs)))
+        crew.do(label_sequence, jobs, on_result, on_frames, gpus)
         return elsewhere
+
+    crew = Crew(workers, ray)
+    gpus = int(ray is not None and settings.frontend.network.device == "cuda")
 
     while jobs:
         jobs = run(jobs)
         _wait_for_one(jobs)
+    refresh(store.folder)
     try:
         store.write_manifest()
     except OutputError as error:  # the labels do not need it, and the next run writes it
@@ -154,6 +158,7 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
         BusyError: another process does it.
         KeyboardInterrupt: it was interrupted; the partial folder is worth nothing.
     """
+    job = replace(job, store=folder_here(job.store, job.url))
     with claimed(job.lock, job.path):
         done = finished_record(job.store, job.name)
         if done is not None:

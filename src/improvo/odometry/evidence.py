@@ -9,18 +9,18 @@ part go on with another scale there. This is a jackknife (Quenouille 1949; Tukey
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from improvo.backend.problem import BundleProblem
 from improvo.backend.settings import ObjectiveSettings, SolverSettings
 from improvo.backend.solver import solve
 from improvo.errors import InputError
 from improvo.geometry import se3
 from improvo.geometry.alignment import align_points
 from improvo.geometry.camera import Camera
+from improvo.odometry.evidence_window import EvidenceKeyframe, EvidenceWindow
+from improvo.odometry.lens_evidence import LensMeasure, measured_lens
 from improvo.odometry.settings import VerdictSettings
 from improvo.odometry.view import Mask, View
 from improvo.types import Float64, Int64
@@ -32,6 +32,7 @@ PARTS = (*QUARTERS, *HALVES)
 _SOLVER = SolverSettings(max_iterations=8, relative_decrease=1e-3)
 _FEW = 8  # observations or common points; fewer determine nothing
 _THIN = 6  # points seen on both sides of a gap between two keyframes; fewer carry no scale across it
+_LENS_KEYFRAMES = 8  # of a window that may say something of the focal length
 _UNDETERMINED = 0.11  # change of the logarithm of the scale that then counts, at least: enough for a mark
 _HASH = 2654435761  # a multiplier of Knuth's, so that the halves of the points are no halves of time or place
 
@@ -45,45 +46,20 @@ class Spread:
         scale_steps: (L, PARTS) change of the logarithm of a part's scale across each of L links between windows.
         link_frames: (L, 2) first and last frame of the keyframes on both sides of each link.
         noise_px: of the observations, standard deviation of one coordinate; NaN where nothing was observed.
+        width: of the picture in pixels.
         fewest: observations that a keyframe has, at least.
         keyframes: of the segment.
+        lens: what the windows say of the focal length.
     """
 
     error_percent: Float64
     scale_steps: Float64
     link_frames: Int64
     noise_px: float
+    width: int
     fewest: int
     keyframes: int
-
-
-@dataclass(frozen=True)
-class _Keyframe:
-    """A final keyframe with what it observed."""
-
-    frame_index: int
-    cam_from_world: Float64  # (4, 4)
-    keypoints: Float64  # (N, 2)
-    points: Int64  # (N,)
-    weights: Float64  # (N,)
-
-
-@dataclass(frozen=True)
-class _Window:
-    """All observations of a window's keyframes."""
-
-    cam_from_world: Float64  # (W, 4, 4)
-    ids: Int64  # (M,) map points, increasing
-    xyz: Float64  # (M, 3)
-    camera: Int64  # (O,)
-    point: Int64  # (O,) row of ids
-    keypoints: Float64  # (O, 2)
-    weights: Float64  # (O,)
-
-    @property
-    def newest(self) -> Int64:
-        """Rows of the points that the last keyframe observes."""
-        return self.point[self.camera == len(self.cam_from_world) - 1]
+    lens: tuple[LensMeasure, ...] = ()
 
 
 @dataclass
@@ -120,13 +96,15 @@ class EvidenceCheck:
         self._camera = camera
         self._settings = settings
         self._objective = objective
-        self._pending: list[_Keyframe] = []  # of the next window; those of the overlap are first
+        self._pending: list[EvidenceKeyframe] = []  # of the next window; those of the overlap are first
         self._overlap = 0
         self._paths = [_Path() for _ in PARTS]
         self._centers: list[Float64] = []  # of the segment itself, one per keyframe
         self._errors: list[float] = []  # pixels, median of each window
         self._scale_steps: list[Float64] = []
         self._links: list[tuple[int, int]] = []
+        self._lens: list[LensMeasure] = []
+        self._lens_due = True  # every other window: those between them share half of their keyframes with each
         self._fewest = np.iinfo(np.int64).max
 
     def add(self, view: View, cam_from_world: Float64, xyz: Float64) -> None:
@@ -138,7 +116,7 @@ class EvidenceCheck:
             xyz: (P, 3) the map as it is now.
         """
         rows = view.observed
-        keyframe = _Keyframe(
+        keyframe = EvidenceKeyframe(
             view.frame_index, cam_from_world, view.keypoints[rows], view.points[rows], view.weights[rows]
         )
         self._pending.append(keyframe)
@@ -167,54 +145,48 @@ class EvidenceCheck:
             scale_steps=np.array(self._scale_steps).reshape(-1, len(PARTS)),
             link_frames=np.array(self._links, np.int64).reshape(-1, 2),
             noise_px=float(np.median(self._errors)) / 1.1774 if self._errors else float("nan"),
+            width=self._camera.width,
             fewest=int(self._fewest),
             keyframes=len(self._centers),
+            lens=tuple(self._lens),
         )
 
     def _solve_window(self, xyz: Float64) -> None:
         """All parts of the pending keyframes; the second half of them is the overlap with the next window."""
         keyframes = self._pending
-        window = _gathered(keyframes, xyz)
-        errors = _errors(window, self._camera)
+        window = EvidenceWindow.of(keyframes, xyz)
+        errors = window.errors(self._camera)
         self._errors.extend([float(np.median(errors))] if len(errors) else [])
+        frames = keyframes[0].frame_index, keyframes[-1].frame_index
         steps = np.zeros(len(PARTS))
         for part, (path, mask) in enumerate(zip(self._paths, self._masks(window), strict=True)):
             steps[part] = _continue(path, self._solved(window, mask), window, self._overlap)
-        thin = _fewest_across(window) < _THIN
+        thin = window.fewest_across() < _THIN
         if thin:
             steps = np.maximum(np.abs(steps), _UNDETERMINED)
         if self._overlap or thin:
             self._scale_steps.append(steps)
-            self._links.append((keyframes[0].frame_index, keyframes[-1].frame_index))
+            self._links.append(frames)
+        if self._lens_due and len(keyframes) >= _LENS_KEYFRAMES:
+            self._lens.append(measured_lens(window, frames, self._camera, self._objective))
+        self._lens_due = not self._lens_due
         self._overlap = min(self._settings.window // 2, len(keyframes))
         self._pending = keyframes[len(keyframes) - self._overlap :]
         for path in self._paths:
             path.world_from_cam = path.world_from_cam[-self._overlap :]
 
-    def _masks(self, window: _Window) -> list[Mask]:
+    def _masks(self, window: EvidenceWindow) -> list[Mask]:
         """Which observations (O,) belong to each of PARTS."""
         left = window.keypoints[:, 0] < 0.5 * self._camera.width
         upper = window.keypoints[:, 1] < 0.5 * self._camera.height
         half = ((window.ids[window.point] * _HASH) >> 7) & 1 == 0
         return [~(upper & left), ~(upper & ~left), ~(~upper & left), ~(~upper & ~left), half, ~half]
 
-    def _solved(self, window: _Window, mask: Mask) -> _Solution:
+    def _solved(self, window: EvidenceWindow, mask: Mask) -> _Solution:
         """The window from a part of its observations; where it starts, if they are too few."""
-        mask = mask & (np.bincount(window.point[mask], minlength=len(window.ids)) >= 2)[window.point]
-        rows, index = np.unique(window.point[mask], return_inverse=True)
-        count = len(window.cam_from_world)
-        if mask.sum() < _FEW * count:
+        problem, rows = window.problem(window.seen_at_least(2, mask), self._camera.K)
+        if len(problem.keypoints) < _FEW * len(window):
             return _Solution(window.cam_from_world, rows, window.ids[rows], window.xyz[rows])
-        problem = BundleProblem(
-            cam_from_world=window.cam_from_world,
-            points=window.xyz[rows],
-            camera_index=window.camera[mask],
-            point_index=index.astype(np.int64),
-            keypoints=window.keypoints[mask],
-            weights=window.weights[mask],
-            K=self._camera.K,
-            fixed_cameras=np.arange(count) == 0,
-        )
         result = solve(problem, self._objective, _SOLVER)
         return _Solution(result.cam_from_world, rows, window.ids[rows], result.points)
 
@@ -229,42 +201,7 @@ def error_percent(path: Float64, reference: Float64) -> float:
     return float(100.0 * np.sqrt(((aligned - reference) ** 2).sum(axis=1).mean()) / max(length, 1e-300))
 
 
-def _gathered(keyframes: Sequence[_Keyframe], xyz: Float64) -> _Window:
-    ids, point = np.unique(np.concatenate([keyframe.points for keyframe in keyframes]), return_inverse=True)
-    return _Window(
-        cam_from_world=np.stack([keyframe.cam_from_world for keyframe in keyframes]),
-        ids=ids,
-        xyz=xyz[ids],
-        camera=np.repeat(np.arange(len(keyframes)), [len(keyframe.points) for keyframe in keyframes]),
-        point=point.astype(np.int64),
-        keypoints=np.concatenate([keyframe.keypoints for keyframe in keyframes]),
-        weights=np.concatenate([keyframe.weights for keyframe in keyframes]),
-    )
-
-
-def _errors(window: _Window, camera: Camera) -> Float64:
-    """Reprojection errors (O,) in pixels of what lies in front of its camera."""
-    in_camera = np.einsum("oij,oj->oi", window.cam_from_world[window.camera, :3, :3], window.xyz[window.point])
-    in_camera += window.cam_from_world[window.camera, :3, 3]
-    front = in_camera[:, 2] > 0
-    return np.asarray(np.linalg.norm(camera.project(in_camera[front]) - window.keypoints[front], axis=1))
-
-
-def _fewest_across(window: _Window) -> int:
-    """Points that are seen before and after a gap between two keyframes, at the gap with the fewest.
-
-    Two observations fix no depth and a scale needs one, so a point counts with three.
-    """
-    count, point, camera = len(window.cam_from_world), window.point, window.camera
-    first, last = np.full(len(window.ids), count), np.full(len(window.ids), -1)
-    np.minimum.at(first, point, camera)
-    np.maximum.at(last, point, camera)
-    known = np.bincount(point, minlength=len(window.ids)) >= min(3, count)
-    begins, ends = (np.bincount(edge[known], minlength=count) for edge in (first, last))
-    return int((np.cumsum(begins) - np.cumsum(ends))[:-1].min())
-
-
-def _continue(path: _Path, solution: _Solution, window: _Window, overlap: int) -> float:
+def _continue(path: _Path, solution: _Solution, window: EvidenceWindow, overlap: int) -> float:
     """Append a solved window to a path; returns how the logarithm of the path's scale has changed.
 
     The overlap's middle keyframe carries pose and the points seen in the overlap carry scale from window to window.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,9 @@ from improvo.odometry.evidence import HALVES, PARTS, QUARTERS, Spread
 from improvo.odometry.settings import VerdictSettings
 from improvo.types import Float64
 
+_SIGMAS = 5.0  # standard errors that a deviation of the focal length must exceed
+_SIGMAS_OF_GROWTH = 8.0  # its change within a window, which a step ahead imitates; 6.7 at most in right recordings
+_LARGEST_LENS_ERROR = 0.06  # of the logarithm of a focal length; a window that knows it less well says nothing of it
 RIGHT, DOUBTFUL, NOT_JUDGED = "right", "doubtful", "not judged"
 
 
@@ -53,6 +57,7 @@ def judge(spread: Spread | None, settings: VerdictSettings, alarms: tuple[str, .
     """
     if spread is None:
         return Verdict(DOUBTFUL if alarms else NOT_JUDGED, evidence=(*alarms, "too few keyframes to judge the path"))
+    alarms = (*alarms, *_lens_alarms(spread, settings))
     error = estimated_error(spread, settings)
     uncertain = _uncertain(spread, settings)
     evidence = [*alarms, _in_words(spread, error, settings)]
@@ -83,15 +88,46 @@ def joined(first: Verdict, second: Verdict, scale_error: float) -> Verdict:
 def estimated_error(spread: Spread, settings: VerdictSettings) -> float:
     """Error of the segment's positions after Sim3, % of its path.
 
-    The root sum of squares of what the parts' paths differ by, and of what the least certain change of scale moves.
+    The root sum of squares of what the paths of the parts differ by, and of what the least certain change of scale
+    moves. Of the two halves of the points the better one counts twice: the other can have too few by chance. Unusual
+    noise is worse than its spread: what does not fit is dropped, so what stays agrees with what is wrong.
     """
+    noise = np.nan_to_num(spread.noise_px) / (settings.usual_noise * spread.width)
+    quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
     scale = settings.scale_share * float(_scale_errors(spread).max(initial=0.0))
-    return float(np.hypot(np.linalg.norm(spread.error_percent), scale))
+    return float(max(noise, 1.0) * np.sqrt((quarters**2).sum() + len(HALVES) * halves.min() ** 2 + scale**2))
 
 
 def _scale_errors(spread: Spread) -> Float64:
-    """(L,) disagreement of the parts about the change of scale across each link, standard deviation of its log."""
-    return np.asarray(np.sqrt((spread.scale_steps**2).mean(axis=1)), np.float64)
+    """(L,) how much the parts change the scale across each link, median of the absolute logarithms."""
+    return np.asarray(np.median(np.abs(spread.scale_steps), axis=1), np.float64)
+
+
+def _lens_alarms(spread: Spread, settings: VerdictSettings) -> tuple[str, ...]:
+    """What contradicts that one lens, the camera's, looked at one world that stands still; most telling first.
+
+    A focal length that is not the camera's can be a zoom or a wrong calibration. Where something large moves, too, its
+    motion and the camera's fit together only with a focal length that is wrong and changes.
+    """
+    alarms: list[str] = []
+    sure = [each for each in spread.lens if each.offset_error < _LARGEST_LENS_ERROR]
+    for each in spread.lens:
+        first, last = each.frames
+        if abs(each.growth) > max(settings.max_focal_change, _SIGMAS_OF_GROWTH * each.growth_error):
+            alarms.append(_told(first, last, f"changes by {100 * abs(np.expm1(each.growth)):.0f} %"))
+    for each in sure:
+        first, last = each.frames
+        if abs(each.offset) > max(settings.max_focal_error, _SIGMAS * each.offset_error):
+            alarms.append(_told(first, last, f"is {np.exp(each.offset):.2f} times that of the camera as given"))
+    for a, b in pairwise(sure):
+        change = b.offset - a.offset
+        if abs(change) > max(settings.max_focal_change, _SIGMAS * float(np.hypot(a.offset_error, b.offset_error))):
+            alarms.append(_told(a.frames[0], b.frames[1], f"changes by {100 * abs(np.expm1(change)):.0f} %"))
+    return tuple(alarms[:1])
+
+
+def _told(first: int, last: int, words: str) -> str:
+    return f"frames {first} to {last} fit best if the focal length {words}: a zoom, a wrong calibration, or a mover"
 
 
 def _uncertain(spread: Spread, settings: VerdictSettings) -> tuple[tuple[int, int], ...]:
@@ -110,12 +146,14 @@ def _in_words(spread: Spread, error: float, settings: VerdictSettings) -> str:
     quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
     worst = int(np.argmax(quarters))
     words = f"estimated error {error:.1f} % of the path: "
+    if spread.noise_px > 1.5 * settings.usual_noise * spread.width:
+        words += f"the points are {spread.noise_px:.1f} pixels off, and "
     scale = float(_scale_errors(spread).max(initial=0.0))
     if settings.scale_share * scale > float(np.linalg.norm(spread.error_percent)):
         first, last = spread.link_frames[int(np.argmax(_scale_errors(spread)))].tolist()
         return words + f"the scale between frames {first} and {last} is known to {100 * scale:.0f} % only"
     if quarters[worst] > 2.0 * halves.max():
-        return words + f"{PARTS[worst]} quarter of the picture it would be another ({quarters[worst]:.1f} %)"
+        return words + f"{PARTS[worst]} quarter of the picture it differs by {quarters[worst]:.1f} %"
     return words + f"{HALVES[int(np.argmax(halves))]} alone differs by {halves.max():.1f} %"
 
 

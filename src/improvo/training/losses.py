@@ -9,6 +9,7 @@ from torch.nn import functional
 from improvo.frontend.architecture import CELL
 from improvo.training.labels import DUSTBIN, IGNORED
 from improvo.training.settings import DetectorLossSettings
+from improvo.training.shared_statistics import share_of_count
 
 
 def detector_loss(logits: Tensor, cells: Tensor, settings: DetectorLossSettings | None = None) -> Tensor:
@@ -25,13 +26,13 @@ def detector_loss(logits: Tensor, cells: Tensor, settings: DetectorLossSettings 
     """
     logits = logits.float()
     total = functional.cross_entropy(logits, cells, ignore_index=IGNORED, reduction="sum")
-    loss = total / (cells != IGNORED).sum().clamp(min=1)
+    loss = total / share_of_count((cells != IGNORED).sum())
     if settings is None or not settings.position_weight:
         return loss
     taught = (cells >= 0) & (cells < DUSTBIN)
     pixels = logits[:, :DUSTBIN].permute(0, 2, 3, 1)[taught]
     targets = _gaussians(settings.position_sigma).to(pixels)[cells[taught]]
-    position = functional.cross_entropy(pixels, targets, reduction="sum") / taught.sum().clamp(min=1)
+    position = functional.cross_entropy(pixels, targets, reduction="sum") / share_of_count(taught.sum())
     return loss + settings.position_weight * position
 
 
@@ -83,7 +84,7 @@ def info_nce_loss(
     backward = torch.logsumexp(similarity, dim=1)
     right = torch.diagonal(similarity, dim1=1, dim2=2)
     loss = 0.5 * (forward + backward) - right
-    return (loss * valid).sum() / valid.sum().clamp(min=1)
+    return (loss * valid).sum() / share_of_count(valid.sum())
 
 
 def _grouped(near: Tensor, group: int, scenes: Tensor | None) -> Tensor:
@@ -144,7 +145,7 @@ def hinge_loss(
     same = torch.cdist(points_b, places_b) <= CELL
     positive = positive_weight * (positive_margin - similarity).clamp(min=0)
     negative = (similarity - negative_margin).clamp(min=0)
-    return (torch.where(same, positive, negative) * compared).sum() / compared.sum().clamp(min=1)
+    return (torch.where(same, positive, negative) * compared).sum() / share_of_count(compared.sum())
 
 
 def stability_loss(logits: Tensor, stability: Tensor, stable_per_unstable: float | None = None) -> Tensor:
@@ -162,9 +163,9 @@ def stability_loss(logits: Tensor, stability: Tensor, stable_per_unstable: float
     """
     errors = functional.cross_entropy(logits.transpose(1, 2), stability, ignore_index=IGNORED, reduction="none")
     if stable_per_unstable is None:
-        return errors.sum() / (stability != IGNORED).sum().clamp(min=1)
+        return errors.sum() / share_of_count((stability != IGNORED).sum())
     stable, unstable = ((errors * (stability == code)).sum() for code in (1, 0))
-    return 0.5 * (stable + stable_per_unstable * unstable) / (stability == 1).sum().clamp(min=1)
+    return 0.5 * (stable + stable_per_unstable * unstable) / share_of_count((stability == 1).sum())
 
 
 def _near(points: Tensor, radius: float) -> Tensor:

@@ -28,6 +28,7 @@ from improvo.formats import FORMAT, FORMAT_KEY, check_format
 from improvo.training.distributed import Process
 from improvo.training.metrics import METRICS, append_metrics, keep_metrics
 from improvo.training.settings import OptimiserSettings
+from improvo.training.shared_statistics import share_batch_norm
 from improvo.training.stage import Stage
 
 CHECKPOINT = "checkpoint.pt"
@@ -88,6 +89,7 @@ class Trainer:
         self.device = choose_device(settings.device)
         self.precision = choose_precision(settings.precision, self.device)
         self.stage = stage.to(self.device, memory_format=torch.channels_last)
+        share_batch_norm(self.stage)
         self.average = deepcopy(self.stage).requires_grad_(False)
         self.batches, self.settings, self.folder, self.allowed = batches, settings, folder, seconds
         self._averaged = [
