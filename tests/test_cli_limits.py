@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import cv2
@@ -105,3 +106,18 @@ sys.exit(main(words))
     assert not [path for path in out.rglob("*") if ".partial" in path.name]
     for path in out.rglob("*.json"):
         json.loads(path.read_text())
+
+
+@pytest.mark.parametrize("also", [(), ("opencv-python",)])
+def test_a_second_opencv_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], also: tuple[str, ...]
+) -> None:
+    def version(name: str) -> str:
+        if name not in ("opencv-contrib-python-headless", *also):
+            raise PackageNotFoundError(name)
+        return "5.0"
+
+    monkeypatch.setattr("improvo.cli.main.version", version)
+    assert main(["info", str(write_walk(tmp_path / "walk", frames=2))]) == 0
+    told = "opencv-python 5.0 and opencv-contrib-python-headless 5.0 are both installed" in capsys.readouterr().err
+    assert told == bool(also)

@@ -237,7 +237,7 @@ def test_a_run_without_any_pose_says_why(tmp_path: Path, capsys: pytest.CaptureF
     for number in range(5):
         cv2.imwrite(str(images / f"{number}.png"), picture)
     out = tmp_path / "out"
-    assert main(["run", str(images), "-o", str(out), "--fov", "60", "--frontend", "orb", "--report"]) == 0
+    assert main(["run", str(images), "-o", str(out), "--fov", "60", "--frontend", "orb", "--report"]) == 3
     text = (out / "report.html").read_text()
     assert "No frame has a pose" in text
     assert 'id="frame-slider"' in text

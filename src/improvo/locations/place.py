@@ -17,7 +17,7 @@ from improvo.errors import InputError, MissingExtraError, OutputError
 Answer = TypeVar("Answer")
 
 STATE = "place.json"  # beside the folder: what of it is at the location
-RECORD = "label.json"  # beside it, everything is fetched one by one; it is sent last
+RECORD = "label.json"  # of a sequence of labels; it is sent last
 _KEPT_HIDDEN = re.compile(r"\.improvo\.json|\..+\.failed\.json")  # hidden files that belong to a folder's content
 _WAITS = (0.5, 2.0, 8.0)  # seconds between tries
 
@@ -50,7 +50,7 @@ class Place:
         return self._fs
 
     def open(self) -> None:
-        """Know what is there, and fetch all that is not fetched one by one."""
+        """Know what is there, and fetch it; of a label store only the records, its tables are fetched one by one."""
         with suppress(OSError, ValueError, TypeError):
             self._sent = dict(json.loads(self._state.read_text())["sent"])
         found = self.tries(self._find, "read", InputError)
@@ -62,7 +62,9 @@ class Place:
             if self.listing.get(name) != size:  # changed there
                 path.unlink(missing_ok=True)
                 del self._sent[name]
-        one_by_one = {name.rpartition("/")[0] for name in self.listing if name.rpartition("/")[2] == RECORD}
+        one_by_one = {
+            name.split("/")[0] for name in self.listing if name.count("/") == 1 and name.endswith(f"/{RECORD}")
+        }
         for name in self.listing:
             folder, _, leaf = name.rpartition("/")
             if (folder not in one_by_one or leaf == RECORD) and not (self.folder / name).exists():

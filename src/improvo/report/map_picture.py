@@ -144,10 +144,10 @@ def _title(run: RunFolder, points: int, outside: int, truth: TruePath | None) ->
     ]
     if outside:
         parts.append(f"{outside} far ones outside the picture")
-    if (run.doubtful | run.uncertain).any():
-        parts.append("doubtful where the band is pink")
     if truth is not None:
         parts.append(f"{truth.text} off the true one")
+    if (run.doubtful | run.uncertain).any():
+        parts.append("doubtful where the band is pink")
     if len(segments) > 1:
         own = "" if run.unit.startswith("metres") else "each with its own scale, "
         parts.append(f"{len(segments)} segments, {own}placed by guess")
