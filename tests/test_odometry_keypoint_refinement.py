@@ -19,7 +19,7 @@ from improvo.odometry.view import PointStore, View
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.sequences import open_sequence
 from improvo.simulation import bundled_sequence
-from improvo.types import Float64, UInt8
+from improvo.types import Float64, Int64, UInt8
 
 CAMERA = Camera(width=200, height=160, fx=180.0, fy=180.0, cx=99.5, cy=79.5)
 DEPTH = 3.0  # of a textured wall that faces the first camera
@@ -62,10 +62,14 @@ def views_with_noise(noise: float) -> tuple[list[View], PointStore, list[Float64
     return views, store, true
 
 
+def observed(views: list[View]) -> list[tuple[View, Int64]]:
+    return [(view, view.observed) for view in views]
+
+
 def test_noisy_keypoints_become_exact_and_those_that_would_go_far_stay() -> None:
     views, store, true = views_with_noise(0.6)
     settings = RefinementSettings()
-    KeypointRefiner(CAMERA, settings, 60).refine(views, store)
+    KeypointRefiner(CAMERA, settings, 60).refine(observed(views), store)
     assert (views[0].keypoints == views[0].detected).all()  # the anchors
     for view, exact in zip(views[1:], true[1:], strict=True):
         moved = (view.keypoints != view.detected).any(axis=1)
@@ -78,7 +82,7 @@ def test_noisy_keypoints_become_exact_and_those_that_would_go_far_stay() -> None
 def test_a_wrong_map_does_not_draw_keypoints_to_its_projections() -> None:
     views, store, true = views_with_noise(0.3)
     store.xyz[:, :2] += 1.2 * DEPTH / CAMERA.fx  # every projection is more than a pixel off
-    KeypointRefiner(CAMERA, RefinementSettings(), 60).refine(views, store)
+    KeypointRefiner(CAMERA, RefinementSettings(), 60).refine(observed(views), store)
     for view, exact in zip(views[1:], true[1:], strict=True):
         moved = (view.keypoints != view.detected).any(axis=1)
         assert np.median(np.linalg.norm(view.keypoints - exact, axis=1)[moved]) < 0.15
@@ -87,12 +91,12 @@ def test_a_wrong_map_does_not_draw_keypoints_to_its_projections() -> None:
 def test_a_forgotten_pose_and_a_dropped_point_give_the_detected_keypoints_back() -> None:
     views, store, _ = views_with_noise(0.6)
     refiner = KeypointRefiner(CAMERA, RefinementSettings(), 60)
-    refiner.refine(views, store)
+    refiner.refine(observed(views), store)
     views[1].forget_pose()
     assert (views[1].keypoints == views[1].detected).all()
     assert not views[1].refined.any()
     views[2].points[:40] = -1
-    refiner.refine([views[2]], store)
+    refiner.refine(observed([views[2]]), store)
     assert (views[2].keypoints[:40] == views[2].detected[:40]).all()
     assert (views[2].keypoints[40:] != views[2].detected[40:]).any()
 
@@ -100,7 +104,7 @@ def test_a_forgotten_pose_and_a_dropped_point_give_the_detected_keypoints_back()
 def test_a_view_without_a_picture_is_passed_over() -> None:
     views, store, _ = views_with_noise(0.6)
     views[1].image = None
-    KeypointRefiner(CAMERA, RefinementSettings(), 60).refine(views, store)
+    KeypointRefiner(CAMERA, RefinementSettings(), 60).refine(observed(views), store)
     assert (views[1].keypoints == views[1].detected).all()
     assert (views[2].keypoints != views[2].detected).any()
 

@@ -18,7 +18,7 @@ from improvo.geometry.camera import Camera
 from improvo.odometry.anchors import Anchors
 from improvo.odometry.patch_alignment import align, cut_patches, repeated, warps_between
 from improvo.odometry.settings import RefinementSettings
-from improvo.odometry.view import Mask, PointStore, View
+from improvo.odometry.view import PointStore, View
 from improvo.types import Float64, Int64, UInt8
 
 _FORGET_EVERY = 10  # frames
@@ -54,15 +54,15 @@ class KeypointRefiner:
             if view.cam_from_world is not None and view.image is not None:
                 self._poses[view.frame_index] = view.cam_from_world
 
-    def refine(self, views: Iterable[View], store: PointStore, only: Mask | None = None) -> None:
-        """Move what the views observe and was not moved yet; a point without an anchor gets one.
+    def refine(self, observations: Iterable[tuple[View, Int64]], store: PointStore) -> None:
+        """Move keypoints that were not moved yet; a point without an anchor gets one.
 
         Args:
-            views: with poses, the ones to be anchors first; one without a picture is passed over.
+            observations: views with poses, those that are to be anchors first, and rows of keypoints that observe a
+                point in them. A view without a picture is passed over.
             store: the points.
-            only: (P,) the points that it is about; None for all.
         """
-        for view in views:
+        for view, rows in observations:
             if view.image is None or view.cam_from_world is None:
                 continue
             self._poses[view.frame_index] = view.cam_from_world
@@ -70,10 +70,7 @@ class KeypointRefiner:
                 self._forget(view.frame_index - self._search_frames, store)
             dropped = view.refined & (view.points < 0)
             view.keypoints[dropped], view.refined[dropped] = view.detected[dropped], False
-            rows = view.observed
             rows = rows[~view.refined[rows]]
-            if only is not None:
-                rows = rows[only[view.points[rows]]]
             slots = self._anchors.slots(view.points[rows])
             self._anchor(view, rows[slots < 0])
             known = slots >= 0

@@ -70,7 +70,7 @@ class LocalMap:
                 return inliers, share
         self._search_by_projection(view)
         self.refiner.update_poses(self.history)
-        self.refiner.refine([view], self.store)
+        self.refiner.refine([(view, view.observed)], self.store)
         return inliers, share
 
     def _is_lost(self, inliers: int, share: float) -> bool:
@@ -172,7 +172,7 @@ class LocalMap:
         """
         tracks = view.tracks[(view.points < 0) & ~view.attached]
         views = [view, *others]
-        seen = [(v, np.flatnonzero(np.isin(v.tracks, tracks) & (v.points < 0) & ~v.attached)) for v in views]
+        seen = [(v, np.flatnonzero(_among(v.tracks, tracks) & (v.points < 0) & ~v.attached)) for v in views]
         track = np.concatenate([v.tracks[rows] for v, rows in seen])
         camera = np.concatenate([np.full(len(rows), i) for i, (_, rows) in enumerate(seen)])
         row = np.concatenate([rows for _, rows in seen])
@@ -194,10 +194,23 @@ class LocalMap:
         ids = np.full(len(counts), NO_POINT)
         ids[good] = self.store.add(result.points[good], view.frame_index)
         point = np.repeat(ids, counts)
+        observations: list[tuple[View, Int64]] = []
         for i, v in enumerate(views):
             of_view = (camera == i) & (point >= 0)
             v.points[row[of_view]] = point[of_view]
-        made = np.zeros(self.store.count, bool)
-        made[ids[good]] = True
-        self.refiner.refine(sorted(views, key=lambda each: each.frame_index), self.store, made)
+            if of_view.any():
+                observations.append((v, row[of_view]))
+        self.refiner.refine(sorted(observations, key=lambda each: each[0].frame_index), self.store)
         return int(good.sum())
+
+
+def _among(tracks: Int64, wanted: Int64) -> Mask:
+    """(N,) which of the tracks (N,) are wanted (K,); by a table, since `numpy.isin` sorts both each time."""
+    if len(wanted) == 0:
+        return np.zeros(len(tracks), bool)
+    first = int(wanted.min())
+    table = np.zeros(int(wanted.max()) - first + 2, bool)  # the last entry stands for all that lie outside
+    table[wanted - first] = True
+    place = tracks - first
+    outside = (place < 0) | (place >= len(table))
+    return table[np.where(outside, len(table) - 1, place)]

@@ -156,7 +156,7 @@ class RansacGateSettings:
 class RefinementSettings:
     """When a keypoint goes to where its map point's patch lies (see `improvo.odometry.keypoint_refinement`)."""
 
-    frontends: Literal["networks", "all", "none"] = "networks"  # classical keypoints are as exact without it
+    frontends: Literal["networks", "all", "none"] = "networks"  # SIFT gains on one recording and loses on another
     max_start: float = 3.0  # pixels between keypoint and projection; a search begins at the projection only within
     max_move: float = 2.0  # pixels from the detected keypoint; one that would go farther stays
     min_correlation: float = 0.8  # of the grey values of both patches

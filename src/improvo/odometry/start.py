@@ -71,7 +71,7 @@ def _grow(
     report = adjust([b], [a], store, K, settings.objective, _SOLVER, window.max_error)
     if report.mean_error > start.max_mean_error or report.kept < 2 * start.min_points:
         return InitFailure("the first two views do not fit")
-    local_map.refiner.refine([a, b], store)
+    local_map.refiner.refine([(a, a.observed), (b, b.observed)], store)
     local_map.remember(a)
     local_map.remember(b)
     done = [b]
