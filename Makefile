@@ -3,16 +3,14 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: demo test lint docs clean
+.PHONY: demo test lint docs locked clean
 
 demo: $(VENV)/.run-installed
 	$(BIN)/improvo demo -o output/demo
 
-# The tests of training and of worker processes have processes of their own: after the threads of all the other
-# libraries, in one long process, they crashed now and then.
+# The tests of training have a process of their own: torch's threads come after those of all the other libraries there.
 test: $(VENV)/.dev-installed lint
-	$(BIN)/python -m pytest --ignore-glob='*/test_training_*' --ignore-glob='*/test_jobs_*'
-	$(BIN)/python -m pytest tests/test_jobs_*.py
+	$(BIN)/python -m pytest --ignore-glob='*/test_training_*'
 	$(BIN)/python -m pytest tests/test_training_*.py
 
 lint: $(VENV)/.dev-installed
@@ -37,6 +35,15 @@ $(VENV)/.dev-installed: $(VENV)/bin/python pyproject.toml
 	$(BIN)/pip install --quiet -e '.[dev]'
 	$(BIN)/pip install --quiet evo  # GPL: the tests run its commands beside us to compare figures; never imported
 	touch $@ $(VENV)/.run-installed
+
+# The versions that requirements-dev.txt names, by their hashes; `make locked test` tests with them. To renew the file:
+# uv pip compile pyproject.toml --extra dev --universal --python-version 3.10 --no-emit-index-url --generate-hashes
+locked: $(VENV)/bin/python
+	$(BIN)/pip install --quiet torch==2.13.0
+	$(BIN)/pip install --quiet --require-hashes -r requirements-dev.txt
+	$(BIN)/pip install --quiet --no-deps -e .
+	$(BIN)/pip install --quiet evo==1.38.1  # GPL, see above
+	touch $(VENV)/.dev-installed $(VENV)/.run-installed
 
 clean:
 	rm -rf $(VENV) output

@@ -30,6 +30,7 @@ from fuzz_targets import EXPECTED, Target, targets  # of the tests: run with PYT
 from mutations import mutated
 
 SECONDS, MEGABYTES = 20.0, 4000  # of one execution, of a child process
+EXAMPLE_SECONDS = 600.0  # of making the example that is damaged
 BATCH, TURN_SECONDS = 500, 8.0  # executions of one child, at most, and how long a target's turn lasts
 PACKAGE = "improvo"
 
@@ -78,14 +79,16 @@ def child_results(name: str, seed: int, end: float) -> Iterator[tuple[str, str, 
         ours, theirs = multiprocessing.Pipe(duplex=False)
         process = multiprocessing.get_context("fork").Process(target=batch, args=(name, seed, done, theirs, end))
         process.start()
+        patience = EXAMPLE_SECONDS
         theirs.close()
         while True:
             try:
-                if not ours.poll(2 * SECONDS):
+                if not ours.poll(patience):
                     process.kill()
-                    yield "fault", f"hangs for {2 * SECONDS:g} s", seed + done
+                    yield "fault", f"hangs for {patience:g} s", seed + done
                     break
                 kind, place = ours.recv()
+                patience = 2 * SECONDS
             except EOFError:
                 process.join()
                 if process.exitcode:
@@ -94,7 +97,8 @@ def child_results(name: str, seed: int, end: float) -> Iterator[tuple[str, str, 
             if kind == "end":
                 process.join()
                 return
-            yield kind, place, seed + done
+            if kind != "begin":
+                yield kind, place, seed + done
             done += kind == "done"
         process.join()
         done += 1
@@ -108,6 +112,7 @@ def batch(name: str, seed: int, first: int, results: Connection, end: float) -> 
     target = targets()[name]
     with tempfile.TemporaryDirectory(prefix="improvo-fuzz-") as place:
         example = Example(target, Path(place) / "example")
+        results.send(("begin", ""))  # making the example does not count
         for number in range(first, BATCH):
             if time.monotonic() > end:
                 break

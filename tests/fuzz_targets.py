@@ -121,7 +121,8 @@ def _recording_targets() -> dict[str, Target]:
         ("v.mp4", lambda path: write_video(path, images(4), codec="mp4v"), 0),
     ]
     texts = (".txt", ".json", ".yaml", ".csv")
-    return {
+    packed = Target(_packed_bag, partial(read_recording, root=1))
+    return {"packed/packed.db3.zstd": packed} | {
         name: Target(_file(name, write), partial(read_recording, root=root), name.endswith(texts))
         for name, write, root in rows
     }
@@ -244,6 +245,91 @@ def _archive_targets() -> dict[str, Target]:
     return targets
 
 
+def _packed_bag(folder: Path) -> Path:
+    """A ROS 2 bag whose database is packed as a file."""
+    try:
+        from compression import zstd
+    except ImportError:
+        from backports import zstd
+    import ros_encoders
+
+    bag = ros_encoders.write_bag(folder / "packed", scene(), 2)
+    database = bag / "packed.db3"
+    packed = database.with_name("packed.db3.zstd")
+    packed.write_bytes(zstd.compress(database.read_bytes()))
+    database.unlink()
+    text = (bag / "metadata.yaml").read_text().replace("packed.db3", "packed.db3.zstd")
+    text = text.replace("compression_format: ''", "compression_format: zstd")
+    text = text.replace("compression_mode: ''", "compression_mode: FILE")
+    (bag / "metadata.yaml").write_text(text)
+    return packed
+
+
+def _training_targets() -> dict[str, Target]:
+    """Files of a training; none where torch is not installed."""
+    try:
+        from training_examples import tiny_trainer
+    except ImportError:
+        return {}
+    from improvo.training.pack import read_pack, write_pack
+    from improvo.training.pictures import Pictures, Source
+    from improvo.training.posed import PosedSequence
+
+    def checkpoint(folder: Path) -> Path:
+        tiny_trainer(folder).run(progress=False)
+        return folder / "checkpoint.pt"
+
+    def pack(folder: Path) -> Path:
+        pictures = tuple(images(2))
+        depth = tuple(np.full(one.shape, 0.5, np.float32) for one in pictures)
+        times, poses_ = np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))
+        posed = PosedSequence("room", pictures, times, np.diag([90.0, 91.0, 1.0]), poses_, depth)
+        source = Source("pictures", pictures, ("a", "b"), 1.0, None)
+        write_pack(folder / "pack.zip", Pictures((source,)), [posed], [])
+        return folder / "pack.zip"
+
+    return {
+        "checkpoint.pt": Target(checkpoint, lambda path: tiny_trainer(path.parent).resume()),
+        "metrics.jsonl": Target(
+            lambda folder: checkpoint(folder).with_name("metrics.jsonl"),
+            lambda path: tiny_trainer(path.parent).resume(),
+            True,
+        ),
+        "pack.zip": Target(pack, read_pack),
+    }
+
+
+def _pose_results(folder: Path) -> Path:
+    """A `pose.json` of `improvo evaluate pose`, of one frontend, solver and gap."""
+    from improvo.config import to_dict
+    from improvo.evaluation.settings import PoseSettings
+
+    settings = to_dict(PoseSettings(gaps=(5,), estimators=("opencv",)))
+    head = {"frontend": "orb", "estimator": "opencv", "gap": 5}
+    names = ("rotation_success", "translation_success", "pose_success", "rotation_auc", "translation_auc")
+    names += ("repeatability", "precision", "keypoints", "matches", "judged_matches", "right_matches", "inliers")
+    names += ("inlier_share", "right_share_3px", "right_share_8px")
+    row = {**head, "pairs": 4, "failures": 0, "median_rotation_deg": 1.0, "median_translation_m": 0.1}
+    row |= dict.fromkeys(names, 0.5) | {f"{name}_interval": [0.25, 0.75] for name in names}
+    curve = {"rotation_deg": [0.0, 1.0], "rotation_accuracy": [0.0, 0.5]}
+    curve |= {"translation_m": [0.0, 0.1], "translation_accuracy": [0.0, 0.5]}
+    sequence = {"name": "room", "frames": 9, "pairs": {"5": 4}, "invalid_poses": 0, "unreadable_frames": 0}
+    content = {
+        "protocol": "pose", "settings": settings, "frontends": ["orb"], "rows": [row], "differences": [],
+        "sequences": [sequence], "sequence_rows": [{"sequence": "room", **row}], "curves": [{**head, **curve}],
+        "gaps": [{"gap": 5, "pairs": 4, "mean_rotation_deg": 3.0, "mean_translation_m": 0.1}],
+    }  # fmt: skip
+    (folder / "pose.json").write_text(json.dumps(content))
+    return folder / "pose.json"
+
+
+def _read_pose_results(path: Path) -> None:
+    from improvo.cli.evaluate_pose import read_results
+    from improvo.evaluation.pose.tables import pose_tables
+
+    pose_tables(read_results(path))
+
+
 def _own_targets() -> dict[str, Target]:
     """Folders that improvo wrote and somebody touched."""
     from improvo.depth.archive import DepthReader, DepthWriter
@@ -317,6 +403,7 @@ def _own_targets() -> dict[str, Target]:
     targets["split.json"] = Target(split, lambda path: remembered_split(path, _unreachable), True)
     targets["judgement.json"] = Target(judgement, lambda path: asdict(read_validation(path)), True)
     targets["marker"] = Target(marker, lambda path: check_output_folder(path.parent, "run"), True)
+    targets["pose.json"] = Target(_pose_results, _read_pose_results, True)
     targets["depth.zip"] = Target(depth, lambda path: DepthReader(path).depth(0))
     return targets
 
@@ -327,5 +414,5 @@ def _unreachable() -> Any:
 
 def targets() -> dict[str, Target]:
     """All parsers, by a name that says what is damaged."""
-    groups = (_picture_targets, _recording_targets, _text_targets, _archive_targets, _own_targets)
+    groups = (_picture_targets, _recording_targets, _text_targets, _archive_targets, _own_targets, _training_targets)
     return {name: target for group in groups for name, target in group().items()}

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -212,6 +214,37 @@ def test_precisions_that_a_runtime_lacks_are_refused(settings):
     pytest.importorskip("torch")
     with pytest.raises(ConfigError, match="precision"):
         NetworkFrontend(random_weights(), NetworkSettings(**settings))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+@pytest.mark.parametrize("order", ["first, second", "second, first"])
+def test_a_signal_after_networks_were_dropped_reaches_its_handler(order):
+    program = f"""
+import gc, os, signal
+import numpy as np
+from improvo.frontend.network import NetworkFrontend
+from network_examples import random_weights
+first, second = (NetworkFrontend(random_weights()) for _ in range(2))
+for each in (first, second):
+    each(np.zeros((40, 48), np.uint8))
+del each
+for name in {order!r}.split(", "):
+    del globals()[name]
+    gc.collect()
+signal.signal(signal.SIGTERM, lambda number, frame: print("handled"))
+os.kill(os.getpid(), signal.SIGTERM)
+"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, f"ended with {done.returncode}"
+    assert "handled" in done.stdout
+
+
+def test_all_networks_share_one_core():
+    from improvo.frontend import openvino_library, runtime_openvino
+
+    sources = [Path(module.__file__).read_text() for module in (openvino_library, runtime_openvino)]
+    assert [source.count("Core()") for source in sources] == [1, 0]
 
 
 def test_inference_needs_no_torch(tmp_path):

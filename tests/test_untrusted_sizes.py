@@ -14,7 +14,11 @@ from typing import Any
 import pytest
 
 from bombs import BOMBS
+from fuzz_targets import targets
+from improvo.errors import InputError
+from improvo.sequences import open_sequence
 from improvo.untrusted.decompression import decompress
+from improvo.untrusted.limits import MIN_FILE_GROWTH
 
 HERE = Path(__file__).parent
 SECONDS, MEGABYTES = 30, 700  # of one file; the second leaves room for the libraries that it loads
@@ -69,3 +73,17 @@ def test_chunks_of_bags_are_unpacked_with_it() -> None:
         assert unpack.func is decompress
     compression = pytest.importorskip("lz4.frame")
     assert mcap.DECOMPRESSORS["lz4"](compression.compress(bytes(99)), 99) == bytes(99)
+
+
+def test_a_bag_that_is_packed_as_a_file_is_unpacked_with_a_limit(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="needs the extra `ros`")
+    try:
+        from compression import zstd
+    except ImportError:
+        zstd = pytest.importorskip("backports.zstd")
+    packed = targets()["packed/packed.db3.zstd"].write(tmp_path)
+    assert len(open_sequence(packed.parent, camera="90,91,47,36.5")) == 3
+    packed.write_bytes(zstd.compress(bytes(MIN_FILE_GROWTH + 1)))
+    assert packed.stat().st_size < 10_000
+    with pytest.raises(InputError, match=f"unpacks to more than {MIN_FILE_GROWTH} bytes"):
+        open_sequence(packed.parent, camera="90,91,47,36.5")

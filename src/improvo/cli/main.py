@@ -7,6 +7,8 @@ import os
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NoReturn
 
@@ -20,6 +22,12 @@ _EPILOG = """\
 `improvo VERB --help` shows a command's options with their defaults.
 Exit status: 0 done, 2 an error that you can correct (one line says how), 3 done, but no frame has a pose,
 130 interrupted, 1 a bug of improvo."""
+_OPENCV_PACKAGES = (
+    *("opencv-python", "opencv-python-headless"),
+    *("opencv-contrib-python", "opencv-contrib-python-headless"),
+)
+_NO_MEMORY = "out of memory; give it more, or smaller pictures (--width), fewer keypoints or fewer --workers"
+_WORDS_OF_NO_MEMORY = ("insufficient memory", "can't allocate memory", "out of memory", "bad_alloc", "start new thread")
 
 
 class HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
@@ -51,6 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = parser_for(words).parse_args(words)
         _check_paths(arguments)
         with output.configured(arguments.quiet, getattr(arguments, "json", False)), termination_interrupts():
+            _say_if_opencv_is_there_twice()
             status = int(arguments.run_command(arguments) or 0)
             locations.close()
             return status
@@ -65,6 +74,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except Exception as error:
+        if not _out_of_memory(error):
+            raise
+        print(f"improvo: {_NO_MEMORY}", file=sys.stderr)
+        return 2
+
+
+def _say_if_opencv_is_there_twice() -> None:
+    """The packages of OpenCV overwrite each other's files, and a user's windows may be gone."""
+    found = []
+    for name in _OPENCV_PACKAGES:
+        with suppress(PackageNotFoundError):
+            found.append(f"{name} {version(name)}")
+    if len(found) > 1:
+        output.notice(
+            f"note: {' and '.join(found)} are both installed and overwrite each other's files, so windows "
+            "(cv2.imshow) may be gone; docs/install.md says how to keep one"
+        )
+
+
+def _out_of_memory(error: Exception) -> bool:
+    """Whether this is how Python, NumPy, OpenCV, torch or OpenVINO say so."""
+    return isinstance(error, MemoryError) or any(words in str(error).lower() for words in _WORDS_OF_NO_MEMORY)
 
 
 def _check_paths(arguments: argparse.Namespace) -> None:

@@ -3,6 +3,11 @@
 By default, `import openvino` writes a client id into the user's home folder, counts how often it was imported, and
 reports it to a web service. It uses the package `openvino_telemetry` for this, and works without it. So that package is
 hidden while OpenVINO loads. A program that has imported OpenVINO before us is left alone.
+
+`CORE` is the only core of the process, and is never freed. With its first graph a core gives the calling thread a stack
+for signal handlers, and unmaps it when it is freed. Of two cores that are freed in the order in which they were made,
+the second puts back the stack of the first, which is gone. The next signal then ends the process with a segmentation
+fault: Ctrl-C after two networks were used and dropped (seen with OpenVINO 2026.4).
 """
 
 from __future__ import annotations
@@ -33,4 +38,6 @@ with _hidden(_TELEMETRY):
     import openvino
     from openvino import opset13
 
-__all__ = ["openvino", "opset13"]
+CORE = openvino.Core()
+
+__all__ = ["CORE", "openvino", "opset13"]

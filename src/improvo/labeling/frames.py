@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -111,9 +112,14 @@ def pack_images(folder: Path, images: Iterable[tuple[UInt8, Mask | None]]) -> in
             if len(group) == _FRAMES_PER_GROUP:
                 flush()
         flush()
-    finally:
         if writer is not None:
             writer.close()
+    except BaseException:
+        if writer is not None:
+            with suppress(OSError):
+                writer.close()
+            writer.is_open = False  # or it tries again when it is freed, and prints a traceback
+        raise
     return count
 
 

@@ -60,7 +60,11 @@ class TrackRecorder:
             error = (type(failure), failure, failure.__traceback__)
             raise
         finally:
-            self._points_writer.__exit__(*error)  # type: ignore[arg-type]
+            try:
+                self._points_writer.__exit__(*error)  # type: ignore[arg-type]
+            except BaseException as failure:
+                self._tracks_writer.__exit__(type(failure), failure, failure.__traceback__)
+                raise
             self._tracks_writer.__exit__(*error)  # type: ignore[arg-type]
 
     def add(self, view: FinalView) -> None:

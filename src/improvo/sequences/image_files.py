@@ -121,7 +121,7 @@ def _may_be_deep(path: Path) -> bool:
     try:
         with path.open("rb") as file:
             head = file.read(64)
-    except OSError:
+    except (OSError, ValueError):  # a name that no system knows: reading it will say so
         return False
     if head.startswith(b"\x89PNG"):
         return len(head) > 24 and head[24] == 16

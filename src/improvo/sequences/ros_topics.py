@@ -16,7 +16,7 @@ from improvo.errors import InputError, MissingExtraError
 from improvo.sequences import ros_messages
 from improvo.sequences.base import UnreadableFrameError
 from improvo.types import Float64, Int64
-from improvo.untrusted.decompression import decompress
+from improvo.untrusted.decompression import decompress, opened_with_limit
 
 _IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _SAMPLES = 16  # messages whose header stamps are compared with the bag's
@@ -63,7 +63,9 @@ def _bound_decompressors() -> None:
         if isinstance(second.zstd, ModuleType):
             zstd = partial(decompress, second.zstd.ZstdDecompressor)
             mcap.DECOMPRESSORS.update(lz4=lambda data, _: lz4(data), zstd=lambda data, _: zstd(data))
-            second.zstd = SimpleNamespace(open=second.zstd.open, compress=second.zstd.compress, decompress=zstd)
+            second.zstd = SimpleNamespace(
+                open=partial(opened_with_limit, second.zstd.open), compress=second.zstd.compress, decompress=zstd
+            )
 
 
 def candidates(reader: Any, path: Path) -> tuple[list[Stream], list[Stream]]:

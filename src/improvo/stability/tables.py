@@ -100,6 +100,7 @@ class _TableWriter:
                 self._flush()
             self._file.close()
         except BaseException as failure:
+            self._file.is_open = False  # or it tries again when it is freed, and prints a traceback
             self._atomic.__exit__(type(failure), failure, failure.__traceback__)
             raise
         self._atomic.__exit__(kind, error, trace)

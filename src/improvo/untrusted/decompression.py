@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
-from improvo.untrusted.limits import MAX_CHUNK_BYTES
+from improvo.untrusted.limits import MAX_CHUNK_BYTES, MAX_FILE_GROWTH, MIN_FILE_GROWTH
 
 
 def decompress(make: Callable[[], Any], data: bytes, limit: int = MAX_CHUNK_BYTES) -> bytes:
@@ -30,3 +32,36 @@ def decompress(make: Callable[[], Any], data: bytes, limit: int = MAX_CHUNK_BYTE
             raise ValueError("it is cut short")
         data = stream.unused_data or b""
     return b"".join(parts)
+
+
+@contextmanager
+def opened_with_limit(open_packed: Callable[..., Any], file: Any, mode: str = "rb") -> Iterator[Any]:
+    """A packed file opened for reading, of which no more can be read than its size makes likely.
+
+    Args:
+        open_packed: such as `zstd.open`.
+        file: the packed file, open.
+        mode: of reading.
+    """
+    limit = max(MIN_FILE_GROWTH, MAX_FILE_GROWTH * os.fstat(file.fileno()).st_size)
+    with open_packed(file, mode) as unpacked:
+        yield _Limited(unpacked, limit)
+
+
+class _Limited:
+    """A readable file that ends with an error instead of going on beyond a limit."""
+
+    def __init__(self, file: Any, limit: int) -> None:
+        self._file, self._left, self._limit = file, limit, limit
+
+    def read(self, size: int = -1) -> bytes:
+        """The next bytes.
+
+        Raises:
+            ValueError: there are more than the limit.
+        """
+        content: bytes = self._file.read(min(size, self._left + 1) if size >= 0 else self._left + 1)
+        self._left -= len(content)
+        if self._left < 0:
+            raise ValueError(f"it unpacks to more than {self._limit} bytes")
+        return content

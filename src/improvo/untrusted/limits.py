@@ -13,5 +13,7 @@ MAX_TEXT_BYTES = 1 << 29  # of any other text: a trajectory of 200 Hz for a day 
 MAX_ARRAY_BYTES = 1 << 29  # of one array in an archive
 MAX_WEIGHTS_BYTES = 1 << 31  # of all tensors in a file; a network of ours has 5 MB
 MAX_CHUNK_BYTES = 1 << 28  # of one compressed part of a bag; recorders write 1 to 4 MB
+MAX_FILE_GROWTH = 200  # times its own size, of a file that is unpacked as a whole; pictures of noise-free rooms have 50
+MIN_FILE_GROWTH = 1 << 26  # bytes that any such file may have
 MAX_TABLE_BYTES = 1 << 33  # of the columns that are read of a table
 MAX_MESSAGE = 120  # characters of a foreign error in our line

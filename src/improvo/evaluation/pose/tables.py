@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from typing import Any
 
+from improvo.evaluation.settings import ESTIMATORS
 from improvo.evaluation.tables import bold_best, columns_to_rows, decimals, markdown
 from improvo.terminal import counted
 
@@ -42,6 +45,28 @@ def pose_tables(results: dict[str, Any], sequences: bool = False) -> str:
                 parts += [f"### {sequence['name']}, solver {estimator}", _table_1(results, rows, estimator)]
             parts += [_shares_table(results, rows)] if shares else []
     return "\n\n".join(parts) + "\n"
+
+
+def check_results(results: dict[str, Any]) -> None:
+    """Look whether the content of a `pose.json` has all that tables and curves need.
+
+    Raises:
+        LookupError, TypeError, ValueError, AttributeError, ArithmeticError: it has not.
+    """
+    settings, frontends = results["settings"], results["frontends"]
+    if not settings["estimators"] or not set(settings["estimators"]) <= set(ESTIMATORS):  # they become names of files
+        raise ValueError("unknown solvers")
+    pose_tables(results, sequences=True)
+    curves = {(curve["frontend"], curve["estimator"], curve["gap"]): curve for curve in results["curves"]}
+    for key in itertools.product(frontends, settings["estimators"], settings["gaps"]):
+        for kind, threshold in (("rotation", "rotation_deg"), ("translation", "translation_m")):
+            x, y = curves[key][threshold], curves[key][f"{kind}_accuracy"]
+            if len(x) != len(y) or not x or not all(isinstance(value, int | float) for value in (*x, *y)):
+                raise ValueError("curves that are no numbers")
+            limits = (settings["max_rotation_deg"], settings["max_translation_m"])
+            if not math.isfinite(sum(map(float, (*x, *y, *limits)))):
+                raise ValueError("numbers that are not finite")
+            float(_cell(results["rows"], *key, f"{kind}_auc"))
 
 
 def _setup(results: dict[str, Any]) -> str:
