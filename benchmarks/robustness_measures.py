@@ -15,6 +15,7 @@ from improvo.odometry.events import Event
 from improvo.odometry.segments import Segment
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import TrackingState
+from improvo.odometry.verdict import RIGHT as RIGHT_WORD
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.types import Features, Float64, Trajectory
 from robustness_clips import Clip
@@ -40,6 +41,8 @@ class JudgedSegment:
     error_percent: float | None  # ATE after Sim3 over the path; None where there is no path or no truth
     reason: str
     doubt: str  # what the run itself says against it; empty where it claims to be right
+    estimated_error_percent: float | None  # by its verdict
+    noise_px: float | None  # of its observations, by its verdict
 
     @property
     def counts(self) -> bool:
@@ -142,9 +145,13 @@ def doubt(segment: Segment, events: Sequence[Event]) -> str:
         return said[0]
     if segment.reason.startswith("contradicted"):
         return segment.reason
-    verdict = getattr(segment, "verdict", None)
-    word = getattr(verdict, "word", "right")
-    return "" if word == "right" else f"{word}: {'; '.join(getattr(verdict, 'evidence', ()))}"
+    verdict = segment.verdict
+    return "" if verdict.word == RIGHT_WORD else f"{verdict.word}: {'; '.join(verdict.evidence)}"
+
+
+def _number(value: float) -> float | None:
+    """JSON has no NaN."""
+    return round(float(value), 4) if np.isfinite(value) else None
 
 
 def _judged(segment: Segment, estimate: Trajectory, truth: Trajectory, events: Sequence[Event]) -> JudgedSegment:
@@ -158,6 +165,8 @@ def _judged(segment: Segment, estimate: Trajectory, truth: Trajectory, events: S
         error,
         segment.reason,
         doubt(segment, events),
+        _number(segment.verdict.error_percent),
+        _number(segment.verdict.noise_px),
     )
 
 

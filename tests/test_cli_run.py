@@ -170,7 +170,7 @@ class TestBadInput:
         message = refused(capsys, str(bare), "-o", str(tmp_path / "out"))
         assert "--fov" in message
         assert not (tmp_path / "out").exists()
-        assert main(["run", str(bare), "-o", str(tmp_path / "out"), "--camera", CAMERA_TEXT, "--max-frames", "4"]) == 0
+        assert main(["run", str(bare), "-o", str(tmp_path / "out"), "--camera", CAMERA_TEXT, "--max-frames", "4"]) == 3
 
     def test_two_images_only(self, walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "2 frames" in refused(capsys, str(walk), "-o", str(tmp_path / "out"), "--max-frames", "2")

@@ -74,7 +74,7 @@ def test_depth_has_the_unit_of_the_run(dense: Path) -> None:
 
 
 def test_without_the_flag_there_is_no_depth(walk: Path, tmp_path: Path) -> None:
-    assert main(["run", str(walk), "-o", str(tmp_path / "out"), *QUICK, "--max-frames", "8"]) == 0
+    assert main(["run", str(walk), "-o", str(tmp_path / "out"), *QUICK, "--max-frames", "8"]) == 3
     assert not (tmp_path / "out" / "depth.zip").exists()
     assert "depth" not in json.loads((tmp_path / "out" / "run.json").read_text())
 

@@ -96,6 +96,7 @@ def test_labels_are_those_of_one_process(cluster, tmp_path, monkeypatch, capsys)
     monkeypatch.chdir(tmp_path)
     walks = [write_walk(Path(name), frames=16, seed=seed) for seed, name in enumerate(("kitchen", "hall"))]
     options = ["--frontend", "orb", "--max-keypoints", "200", "--set", "labels.min_observations=6"]
+    options += ["--set", "labels.quality.enabled=false"]
     here = ["label", *map(str, walks), "nowhere", *options]
     assert main([*here, "-o", "here"]) == 0
     assert main([*here, "-o", "there", "--ray", "local"]) == 0  # relative paths
@@ -109,7 +110,7 @@ def test_a_worker_that_is_killed_in_the_middle_changes_nothing(cluster, tmp_path
     monkeypatch.chdir(tmp_path)
     walks = [write_walk(Path(name), frames=40, seed=seed) for seed, name in enumerate(("kitchen", "hall"))]
     words = ["label", *map(str, walks), "--frontend", "orb", "--max-keypoints", "200"]
-    words += ["--set", "labels.min_observations=6"]
+    words += ["--set", "labels.min_observations=6", "--set", "labels.quality.enabled=false"]
     assert main([*words, "-o", "here"]) == 0
     killed: list[int] = []
 

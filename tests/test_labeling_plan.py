@@ -16,6 +16,7 @@ from improvo.labeling.plan import LabelPlan, plan_labels
 from improvo.odometry.run_settings import LabelRunSettings, RunSettings
 
 ORB = ["--frontend", "orb", "--max-keypoints", "200", "--set", "labels.min_observations=6"]
+ORB += ["--set", "labels.quality.enabled=false"]
 
 
 def plan_of(**changed: float) -> LabelPlan:

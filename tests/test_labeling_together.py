@@ -20,6 +20,7 @@ from improvo.labeling.store import DONE, LabelStore, SequenceRecord, lock_of, re
 from improvo.odometry.run_settings import LabelRunSettings
 
 OPTIONS = ["--frontend", "orb", "--max-keypoints", "200", "--set", "labels.min_observations=6"]
+OPTIONS += ["--set", "labels.quality.enabled=false"]
 SETTINGS = {"frontend": {"name": "orb"}}
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no fcntl")

@@ -1,22 +1,13 @@
-"""Label stores and outputs at a location: in memory, and on an S3 server on this machine where one is installed."""
+"""Label stores at a location, faults of the location, and what is where."""
 
 from __future__ import annotations
 
-import importlib.util
-import os
-import socket
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from rendered_walk import write_walk
 
-from improvement_example import SETTINGS
 from improvo import locations
 from improvo.cli.main import main
 from improvo.errors import InputError, OutputError
@@ -26,87 +17,14 @@ from improvo.labeling.label_sequences import LabelJob, label_sequence
 from improvo.labeling.labeled import read_labels
 from improvo.locations import fetched, is_remote, local_folder, publish, with_urls
 from improvo.odometry.run_settings import LabelRunSettings
-from improvo.stability.settings import LabelSettings
+from improvo.stability.settings import LabelQualitySettings, LabelSettings
 from labeled_scene import write_labeled_scene
+from location_places import cache, forget, fsspec, memory, names, s3, upload
 
-fsspec = pytest.importorskip("fsspec", reason="locations need the extra `remote`")
+__all__ = ["cache", "memory", "s3"]  # fixtures
 
-ORB = ["--frontend", "orb", "--max-keypoints", "200", "--set", "labels.min_observations=6", "--pack"]
-BUCKET = "improvo-test"
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder for what stands for locations, and no waiting between tries."""
-    monkeypatch.setenv("IMPROVO_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(locations, "_WAITS", (0.0, 0.0))
-    locations._places.clear()
-    yield tmp_path / "cache"
-    locations._places.clear()
-
-
-@pytest.fixture
-def memory() -> Iterator[str]:
-    """A location in memory, empty."""
-    system = fsspec.filesystem("memory")
-    system.store.clear()
-    yield "memory://bucket/work"
-    system.store.clear()
-
-
-@pytest.fixture(scope="module")
-def s3() -> Iterator[str]:
-    """A location on an S3 server of our own."""
-    for name in ("moto", "s3fs", "flask"):
-        if importlib.util.find_spec(name) is None:
-            pytest.skip(f"needs an S3 server: pip install 'moto[server]' s3fs ({name} is missing)")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    server = subprocess.Popen(
-        [sys.executable, "-m", "moto.server", "-p", str(port)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    keys = {"AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b", "AWS_DEFAULT_REGION": "us-east-1"}
-    keys["AWS_ENDPOINT_URL"] = keys["AWS_ENDPOINT_URL_S3"] = f"http://127.0.0.1:{port}"
-    before = {name: os.environ.get(name) for name in keys}
-    os.environ.update(keys)
-    try:
-        ends = time.monotonic() + 120
-        while time.monotonic() < ends:
-            try:
-                socket.create_connection(("127.0.0.1", port), 1).close()
-                break
-            except OSError:
-                time.sleep(0.1)
-        fsspec.filesystem("s3").mkdir(BUCKET)
-        yield f"s3://{BUCKET}/work"
-    finally:
-        server.terminate()
-        server.wait()
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
-
-
-def names(url: str) -> set[str]:
-    """Of the files at a location."""
-    system, root = fsspec.core.url_to_fs(url)
-    system.invalidate_cache()
-    return {name.removeprefix(root).lstrip("/") for name in system.find(root)}
-
-
-def upload(folder: Path, url: str) -> None:
-    system, root = fsspec.core.url_to_fs(url)
-    for path in folder.rglob("*"):
-        if path.is_file():
-            system.pipe_file(f"{root}/{path.relative_to(folder).as_posix()}", path.read_bytes())
-
-
-def forget(cache: Path) -> None:
-    """As on another machine."""
-    import shutil
-
-    locations._places.clear()
-    shutil.rmtree(cache)
+ORB = ["--frontend", "orb", "--max-keypoints", "200", "--set", "labels.min_observations=6"]
+ORB += ["--set", "labels.quality.enabled=false", "--pack"]
 
 
 def test_paths_of_this_machine_stay_what_they_are(tmp_path: Path) -> None:
@@ -169,58 +87,13 @@ def test_labels_on_s3(s3: str, tmp_path: Path, cache: Path) -> None:
     check_labels(s3, tmp_path, cache)
 
 
-def check_training(url: str, tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A training that was stopped goes on elsewhere, and ends with the weights of one that was not."""
-    pytest.importorskip("torch", reason="training needs the extra `train`")
-    store = write_labeled_scene(tmp_path / "labels")
-    upload(store, f"{url}/labels")
-    words = ["train", "odometry", f"{url}/labels", "--from", "superpoint-small", "--batch-size", "2"]
-    words += ["--workers", "0", "--threads", "1"]
-    words += ["--set", "views.height=48", "--set", "views.width=64", "--set", "optimiser.decay_steps=1"]
-    assert main([*words, "--steps", "2", "-o", f"{url}/network"]) == 0
-    assert f"{url}/network/weights.safetensors" in capsys.readouterr().out
-    assert {"weights.safetensors", "weights.json", "metrics.jsonl", "checkpoint.pt"} <= names(f"{url}/network")
-    assert not any("landmarks" in name for name in names(f"{url}/labels"))
-    forget(cache)
-    assert main([*words, "--steps", "4", "-o", f"{url}/network"]) == 0
-    assert main([*words, "--steps", "2", "-o", str(tmp_path / "local")]) == 0
-    assert main([*words, "--steps", "4", "-o", str(tmp_path / "local")]) == 0
-    system, root = fsspec.core.url_to_fs(f"{url}/network")
-    trained = system.cat_file(f"{root}/metrics.jsonl").decode().splitlines()
-    assert [line.split(",")[0] for line in trained] == ['{"step": 2', '{"step": 4']
-    assert len((tmp_path / "local" / "metrics.jsonl").read_text().splitlines()) == len(trained)
-
-
-def test_training_in_memory(memory: str, tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    check_training(memory, tmp_path, cache, capsys)
-
-
-def test_training_on_s3(s3: str, tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    check_training(s3, tmp_path, cache, capsys)
-
-
-def test_a_loop_goes_on_elsewhere(memory: str, tmp_path: Path, cache: Path) -> None:
-    pytest.importorskip("torch", reason="training needs the extra `train`")
-    from improvement_example import FakeTraining
-    from improvement_example import run as improve
-
-    walk = write_walk(tmp_path / "room", frames=30, seed=3)
-    settings = replace(SETTINGS, frontend=replace(SETTINGS.frontend, name="superpoint-small"))
-    first, second = FakeTraining(), FakeTraining()
-    improve(local_folder(f"{memory}/better"), [walk], first, rounds=1, settings=settings)
-    publish(local_folder(f"{memory}/better"))
-    weights = fsspec.filesystem("memory").cat_file("/bucket/work/better/weights.safetensors")
-    forget(cache)
-    result = improve(local_folder(f"{memory}/better"), [walk], second, rounds=1, settings=settings)
-    assert (len(first.calls), len(second.calls)) == (1, 0)
-    assert result.weights.read_bytes() == weights
-
-
 def test_a_worker_on_another_machine_labels_into_the_location(memory: str, tmp_path: Path, cache: Path) -> None:
     walk = write_walk(tmp_path / "attic", frames=16, seed=0)
     elsewhere = tmp_path / "no" / "such" / "folder"
     network = FrontendSettings(name="orb", max_keypoints=200)
-    settings = LabelRunSettings(frontend=network, labels=LabelSettings(min_observations=6))
+    settings = LabelRunSettings(
+        frontend=network, labels=LabelSettings(min_observations=6, quality=LabelQualitySettings(enabled=False))
+    )
     record = label_sequence(LabelJob("attic", walk, elsewhere, settings, False, memory), lambda: None)
     assert record.tracked > 10
     assert {"attic/label.json", "attic/tracks.parquet"} <= names(memory)
@@ -248,21 +121,21 @@ class Failing:
 
 def test_a_fault_that_passes_is_tried_again(memory: str) -> None:
     folder = local_folder(memory)
-    place = locations._places[folder]
-    place._fs = Failing(place.fs, "put_file", 2, TimeoutError("slow"))
+    opened = locations._places[folder]
+    opened._fs = Failing(opened.fs, "put_file", 2, TimeoutError("slow"))
     write_text(folder / "a.txt", "one")
     assert names(memory) == {"a.txt"}
-    assert place._fs.left == 0
+    assert opened._fs.left == 0
 
 
 def test_a_full_bucket_is_one_line_and_a_second_start_goes_on(memory: str) -> None:
     folder = local_folder(memory)
-    place = locations._places[folder]
-    place._fs = Failing(place.fs, "put_file", 1000, OSError("QuotaExceeded:\n no room"))
+    opened = locations._places[folder]
+    opened._fs = Failing(opened.fs, "put_file", 1000, OSError("QuotaExceeded:\n no room"))
     words = rf"{memory}: cannot be written \(QuotaExceeded: no room\); what is done is kept in .*; run again to go on"
     with pytest.raises(OutputError, match=words):
         write_text(folder / "a.txt", "one")
-    assert place._fs.left == 997
+    assert opened._fs.left == 997
     locations._places.clear()
     again = local_folder(memory)
     assert (again / "a.txt").read_text() == "one"

@@ -151,7 +151,7 @@ def test_keypoints_of_a_run_are_on_used_pixels(tmp_path: Path) -> None:
     walk = write_walk(tmp_path / "walk", frames=8)
     first = next(iter(open_sequence(walk))).image
     mask = written(tmp_path / "mask.png", half(first.shape[1], first.shape[0]))
-    assert main(["run", str(walk), "-o", str(tmp_path / "out"), "--mask", mask, "--frontend", "orb"]) == 0
+    assert main(["run", str(walk), "-o", str(tmp_path / "out"), "--mask", mask, "--frontend", "orb"]) == 3
     keypoints = read_tracks(tmp_path / "out" / TRACKS_FILE).keypoints
     assert len(keypoints) > 100
     assert (np.rint(keypoints[:, 0]) < first.shape[1] // 2 - BORDER).all()

@@ -198,6 +198,9 @@ def test_what_is_wrong_is_said_in_plain_words() -> None:
     assert "too little parallax" in words(report(frames=none, events=[waiting]))
     assert "Dark frames (mean grey value under 25 of 255): 0" in words(report(), brightness=9.0)
     assert "2 segments" in words(report(segments=[{"first": 0}, {"first": 6}]))
+    verdict = {"word": "doubtful", "evidence": ["the parts disagree"], "uncertain": [], "error_percent": 8.0}
+    doubted = {"number": 0, "first": 0, "last": 9, "verdict": verdict}
+    assert "Segment 0 (frames 0 to 9) is doubtful: the parts disagree." in words(report(segments=[doubted]))
     assert "Check the calibration" in words(report(), error=2.5)
     skipped = [{"index": 3, "source": "a.png", "reason": "truncated"}]
     assert "a.png: truncated" in words(report(input={"skipped": skipped, "notes": []}))
@@ -234,7 +237,7 @@ def test_a_run_without_any_pose_says_why(tmp_path: Path, capsys: pytest.CaptureF
     for number in range(5):
         cv2.imwrite(str(images / f"{number}.png"), picture)
     out = tmp_path / "out"
-    assert main(["run", str(images), "-o", str(out), "--fov", "60", "--frontend", "orb", "--report"]) == 0
+    assert main(["run", str(images), "-o", str(out), "--fov", "60", "--frontend", "orb", "--report"]) == 3
     text = (out / "report.html").read_text()
     assert "No frame has a pose" in text
     assert 'id="frame-slider"' in text

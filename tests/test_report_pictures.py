@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -172,6 +173,23 @@ def test_bad_requests_are_one_line_with_the_mend(
     message = capsys.readouterr().err.strip().splitlines()
     assert len(message) == 1
     assert said in message[0]
+
+
+def test_a_pair_is_named_by_frames_or_by_the_time_between_them() -> None:
+    from improvo.cli.show_recording import _pair
+    from improvo.errors import ConfigError, InputError
+    from improvo.sequences import open_sequence
+    from improvo.simulation import bundled_sequence
+
+    sequence = open_sequence(bundled_sequence())  # 30 a second
+    assert _pair("3,40", sequence) == [3, 40]
+    assert _pair("3,+5", sequence) == [3, 8]
+    assert _pair("10,+1.5s", sequence) == [10, 55]
+    for wrong in ("3", "3,", "a,4", "3,+s", "3,4,5", "3,+x"):
+        with pytest.raises((InputError, ConfigError), match=re.escape(f"{wrong.split(',')[0]}")):
+            _pair(wrong, sequence)
+    with pytest.raises(ConfigError, match="no frame 163"):
+        _pair("13,+5s", sequence)
 
 
 def test_suppressed_regions_are_where_most_suppressed_points_are() -> None:

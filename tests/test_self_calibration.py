@@ -16,7 +16,6 @@ from improvo.self_calibration.first_guess import agreement, far_pairs, guesses
 from improvo.self_calibration.from_motion import CameraFromMotion, LensFound, lens_of_pieces, refuse_unsure
 from improvo.self_calibration.lens import MODELS, NAMES, Lens, lens_of, lens_with_fov
 from improvo.self_calibration.raw_features import Piece, piece_rows
-from improvo.self_calibration.rejoining import SceneView, rejoined
 from improvo.self_calibration.settings import SelfCalibrationSettings
 from improvo.types import Features, Float64
 
@@ -227,32 +226,6 @@ def test_motions_that_do_not_tell_the_camera_are_refused(motion: Float64, world:
     with pytest.raises(InputError, match=r"^video: .*; walk sideways") as error:
         refuse_unsure(result(lens_of_pieces([piece(world, motion)], 320, 240, SETTINGS, "video")), "video", SETTINGS)
     assert "\n" not in str(error.value)
-
-
-def test_points_seen_again_become_one_and_longer() -> None:
-    truth = scene(BROWN, 0, noise=0.0)
-    rng = np.random.default_rng(0)
-    descriptors = rng.normal(size=(len(truth.xyz), 32))
-    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-    views = []
-    for number in range(len(truth.cam_from_world)):
-        here = truth.view == number
-        views.append(SceneView(truth.pixels[here], descriptors[truth.point[here]].astype(np.float32), 0.7, 0))
-    halves = np.where(truth.view < len(views) // 2, truth.point, truth.point + len(truth.xyz))  # as two visits
-    order = np.lexsort((truth.view, halves))
-    split = replace(
-        truth,
-        xyz=np.concatenate([truth.xyz, truth.xyz]),
-        view=truth.view[order],
-        point=halves[order],
-        pixels=truth.pixels[order],
-    ).without(np.zeros(len(order), bool))
-    joined = rejoined(split, views, 5.0)
-    assert len(split.xyz) > 1.5 * len(joined.xyz)
-    # points that neither visit saw three times are gone; the others have all their observations again
-    assert 0.9 * len(truth.xyz) < len(joined.xyz) <= len(truth.xyz)
-    assert len(joined.view) / len(joined.xyz) >= len(truth.view) / len(truth.xyz)
-    assert joined.errors().max() < 1e-6
 
 
 def test_pieces_cover_short_videos_and_sample_long_ones() -> None:

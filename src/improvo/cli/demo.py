@@ -49,7 +49,9 @@ def run(arguments: argparse.Namespace) -> int:
     do("report", before)
     if importlib.util.find_spec("torch") is None:
         say("\nThe rest, where the frontend learns from this room, needs an extra: pip install 'improvo[train]'")
-        next_step(f"open {before / 'report.html'}, or install the extra and run `improvo demo` again")
+        next_step(
+            f"open {before / 'report.html'}, or install the extra and run `improvo demo -o {arguments.output}` again"
+        )
         return 0
     say("\nNow the frontend learns from this room, and is validated on what it never saw; beside it a control.")
     options = ["--control", "--set", "split.share=0.4"]  # of so short a recording, for pairs 30 frames apart

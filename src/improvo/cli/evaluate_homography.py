@@ -11,7 +11,7 @@ from pathlib import Path
 
 from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments
 from improvo.cli.options import add_config_arguments, settings_from
-from improvo.cli.output import figures, next_step
+from improvo.cli.output import figures, next_after_figures
 from improvo.errors import InputError
 from improvo.evaluation.settings import HomographyCommandSettings, HomographySettings
 
@@ -78,5 +78,5 @@ def run(arguments: argparse.Namespace) -> int | None:
         make_output_folder(arguments.output, COMMAND)
         write_json(arguments.output / "homography.json", results)
         write_text(arguments.output / "homography.md", text)
-        next_step(f"`improvo report {arguments.output}` makes a page of it")
+    next_after_figures(arguments.output)
     return 0

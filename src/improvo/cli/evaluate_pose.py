@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments, add_truth_argument
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
-from improvo.cli.output import figures, next_step, say
+from improvo.cli.output import figures, next_after_figures, say
 from improvo.errors import ConfigError, ImprovoError, InputError
 from improvo.evaluation.settings import ESTIMATORS, USUAL_OVERLAPS, PoseCommandSettings, PoseSettings
 from improvo.geometry.depth_sampling import SAMPLINGS
@@ -108,7 +108,9 @@ def run(arguments: argparse.Namespace) -> int | None:
     if arguments.results is not None:
         results = read_results(arguments.results)
         figures(results, pose_tables(results, arguments.per_sequence))
-        _draw(results, arguments.results.parent if arguments.output is None else arguments.output)
+        folder = arguments.results.parent if arguments.output is None else arguments.output
+        _draw(results, folder)
+        next_after_figures(folder)
         return 0
     if not arguments.sequences:
         raise InputError("improvo evaluate pose: give a SEQUENCE, or --from POSE.JSON")
@@ -116,8 +118,7 @@ def run(arguments: argparse.Namespace) -> int | None:
         return _export(arguments)
     results = _evaluate(arguments)
     figures(results, pose_tables(results, arguments.per_sequence))
-    if arguments.output is not None:
-        next_step(f"`improvo report {arguments.output}` makes a page of it")
+    next_after_figures(arguments.output)
     return 0
 
 

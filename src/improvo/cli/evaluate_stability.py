@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from improvo.cli.output import figures, next_step
+from improvo.cli.output import figures, next_after_figures
 
 COMMAND = "evaluate stability"
 
@@ -66,5 +66,5 @@ def run(arguments: argparse.Namespace) -> int:
         write_json(arguments.output / "stability.json", results)
         write_text(arguments.output / "stability.md", text)
         draw_stability(scored, results, arguments.output / "stability.png")
-        next_step(f"`improvo report {arguments.output}` makes a page of it")
+    next_after_figures(arguments.output)
     return 0

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
-from improvo.cli.output import figures, next_step
+from improvo.cli.output import figures, next_after_figures
 from improvo.errors import InputError
 from improvo.evaluation.settings import ALIGNMENTS, TrajectoryCommandSettings, TrajectorySettings
 from improvo.sequences.base import SequenceSettings
@@ -101,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int | None:
         make_output_folder(arguments.output, COMMAND)
         write_json(arguments.output / "trajectory.json", result)
         write_text(arguments.output / "trajectory.md", text)
-        next_step(f"`improvo report {arguments.output}` makes a page of it")
+    next_after_figures(arguments.output)
     return 0
 
 

@@ -16,7 +16,7 @@ from improvo.cli.evaluate_options import (
 )
 from improvo.cli.evaluate_trajectory import TRAJECTORY_FLAGS, add_trajectory_arguments
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
-from improvo.cli.output import figures, next_step
+from improvo.cli.output import figures, next_after_figures
 from improvo.evaluation.settings import VoCommandSettings
 
 COMMAND = "evaluate vo"
@@ -84,5 +84,5 @@ def run(arguments: argparse.Namespace) -> int | None:
             write_trajectory(folder / f"{outcome.sequence}.txt", outcome.trajectory)
         write_json(output / "vo.json", results)
         write_text(output / "vo.md", text)
-        next_step(f"`improvo report {arguments.output}` makes a page of it")
+    next_after_figures(arguments.output)
     return 0

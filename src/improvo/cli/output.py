@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from improvo import terminal
@@ -37,6 +38,14 @@ def say(text: str) -> None:
 def next_step(text: str) -> None:
     """The last line: what to do next."""
     say(f"next: {text}")
+
+
+def next_after_figures(folder: Path | None) -> None:
+    """The last line of an evaluation: a page of the folder of its results, or how to keep them."""
+    if folder is None:
+        next_step("the same with -o OUT keeps the figures, and `improvo report OUT` makes a page of them")
+    else:
+        next_step(f"`improvo report {folder}` makes a page of it")
 
 
 def notice(text: str) -> None:

@@ -42,7 +42,8 @@ def say_label_plan(plan: LabelPlan) -> None:
         f"sample: {plan.sample_frames} frames on this machine: {values['frames_per_second_per_core']:.3g} frames a "
         f"second per core, {plan.recording_seconds:.2g} core-seconds more for each recording"
     )
-    say(f"all: {plan.recordings} recordings, {plan.frames} frames: {duration(plan.core_seconds)} of one core")
+    recordings = f"{plan.recordings} recording{'s' * (plan.recordings != 1)}"
+    say(f"all: {recordings}, {plan.frames} frames: {duration(plan.core_seconds)} of one core")
     memory = f"{plan.memory_mib} MiB of memory for each worker, " if plan.memory_mib else ""
     say(f"needs {memory}{size(plan.storage_mib)} of disk for the labels")
     times = ", ".join(f"{n}: {duration(plan.seconds(n))}" for n in useful_workers(plan))

@@ -64,7 +64,7 @@ def add_matches_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `improvo show matches`."""
     _add_recording(parser, "./matches.png")
     parser.add_argument("--frontends", default="superpoint-vo,sift", metavar="A,B", help="one row of panels each")
-    parser.add_argument("--pair", default="0,30", metavar="A,B", help="the two frames")
+    parser.add_argument("--pair", default="0,+1s", metavar="A,B", help="the two frames; +5 frames or +1s after A for B")
     parser.add_argument("--max-keypoints", type=int, default=500, metavar="N", help="per frame")
     add_sequence_arguments(parser)
     add_config_arguments(parser)
@@ -83,9 +83,7 @@ def run_matches(arguments: argparse.Namespace) -> None:
     for name in names:
         check_frontend(name)
     sequence, _ = _opened_sequence(arguments)
-    pair = chosen_frames(arguments.pair, len(sequence))
-    if len(pair) != 2 or "," not in arguments.pair:
-        raise InputError(f"--pair {arguments.pair}: give two frames, such as 0,30")
+    pair = _pair(arguments.pair, sequence)
     frame_a, frame_b = (sequence[frame] for frame in pair)
     depth_a = sequence.depth(pair[0])
     rows = [
@@ -104,6 +102,34 @@ def run_matches(arguments: argparse.Namespace) -> None:
     write_png(target, np.concatenate(rows))
     say(str(target))
     next_step("open it")
+
+
+def _pair(text: str, sequence: Sequence) -> list[int]:
+    """The two frames that `--pair` names.
+
+    Raises:
+        InputError: it names no two frames. ConfigError: there is no such frame.
+    """
+    import numpy as np
+
+    mend = InputError(f"--pair {text}: give two frames, such as 0,30, or 0,+5 (frames later), or 0,+1s (seconds later)")
+    first, comma, second = text.partition(",")
+    if not comma or not first.strip().isdecimal():
+        raise mend
+    if second.startswith("+"):
+        in_seconds = second.endswith("s")
+        try:
+            later = float(second[1:-1]) if in_seconds else float(int(second[1:]))
+        except ValueError:
+            raise mend from None
+        if in_seconds:
+            step = float(np.median(np.diff(sequence.times))) if len(sequence) > 1 else 1.0
+            later = max(1, round(later / step))
+        second = str(int(first) + int(later))
+    frames = chosen_frames(f"{first},{second}", len(sequence))
+    if len(frames) != 2:
+        raise mend
+    return frames
 
 
 def _add_recording(parser: argparse.ArgumentParser, default: str) -> None:

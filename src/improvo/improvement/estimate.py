@@ -10,6 +10,7 @@ from pathlib import Path
 from improvo.errors import OutputError
 from improvo.improvement.recipe import steps_of
 from improvo.improvement.settings import HELD, ImproveSettings
+from improvo.terminal import counted
 
 # seconds on two calm cores with `superpoint-small`; `superpoint` takes about four times as long where it trains
 _SECONDS_PER_FRAME = 0.12  # of odometry, at 640x480
@@ -36,7 +37,7 @@ class Estimate:
     def words(self) -> str:
         """For a person."""
         minutes = max(self.minutes, 1)
-        time = f"{minutes:.0f} minutes" if minutes < 100 else f"{minutes / 60:.1f} hours"
+        time = counted(round(minutes), "minute") if minutes < 100 else f"{minutes / 60:.1f} hours"
         return (
             f"about {time} on two calm cores, {self.memory_mib / 1024:.1f} GiB of memory "
             f"and {_size(self.disk_mib)} of disk; {self.steps} steps of training a round"

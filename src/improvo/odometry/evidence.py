@@ -46,6 +46,7 @@ class Spread:
         scale_steps: (L, PARTS) change of the logarithm of a part's scale across each of L links between windows.
         link_frames: (L, 2) first and last frame of the keyframes on both sides of each link.
         noise_px: of the observations, standard deviation of one coordinate; NaN where nothing was observed.
+        width: of the picture in pixels.
         fewest: observations that a keyframe has, at least.
         keyframes: of the segment.
         lens: what the windows say of the focal length.
@@ -55,6 +56,7 @@ class Spread:
     scale_steps: Float64
     link_frames: Int64
     noise_px: float
+    width: int
     fewest: int
     keyframes: int
     lens: tuple[LensMeasure, ...] = ()
@@ -143,6 +145,7 @@ class EvidenceCheck:
             scale_steps=np.array(self._scale_steps).reshape(-1, len(PARTS)),
             link_frames=np.array(self._links, np.int64).reshape(-1, 2),
             noise_px=float(np.median(self._errors)) / 1.1774 if self._errors else float("nan"),
+            width=self._camera.width,
             fewest=int(self._fewest),
             keyframes=len(self._centers),
             lens=tuple(self._lens),

@@ -101,6 +101,7 @@ class VerdictSettings:
     # What a change of scale between two windows moves the path by: % of it for a change by the factor e. Calibrated on
     # simulated and real recordings with truth (docs/odometry.md).
     scale_share: float = 40.0
+    usual_noise: float = 0.0016  # share of the picture's width; the estimate grows with noise that is larger
     max_error: float = 5.0  # % of the path; a larger estimated error makes a segment doubtful
     max_focal_change: float = 0.12  # of the logarithm of the focal length, within a window or from one to the next
     max_focal_error: float = 0.2  # of the logarithm of the focal length, from that of the camera as given
@@ -109,8 +110,8 @@ class VerdictSettings:
     def __post_init__(self) -> None:
         if self.window < 4:
             raise ConfigError(f"verdict.window={self.window}: must be at least 4 keyframes")
-        if not self.max_error > 0:
-            raise ConfigError(f"verdict.max_error={self.max_error}: must be positive, % of the path")
+        if not (self.usual_noise > 0 and self.max_error > 0):
+            raise ConfigError("verdict: usual_noise and max_error must be positive")
 
 
 @dataclass(frozen=True)

@@ -44,11 +44,18 @@ def uncertain_frames(report: Mapping[str, Any], frame_indices: Int64) -> Mask:
     return found
 
 
-def verdict_lines(report: Mapping[str, Any]) -> list[str]:
-    """One line for each segment: its frames, the word, and why."""
+def verdict_lines(report: Mapping[str, Any], only: str | None = None) -> list[str]:
+    """One line for each segment: its frames, the word, and why.
+
+    Args:
+        report: the content of run.json.
+        only: this word; None: all of them.
+    """
     lines = []
     for each in report["segments"]:
         verdict = verdict_of(each)
+        if only not in (None, verdict["word"]):
+            continue
         why = "; ".join(verdict["evidence"]) or "there is no verdict of it"
         frames = f"frames {each['first']} to {each['last']}"
         lines.append(f"segment {each['number']} ({frames}) is {verdict['word']}: {why}")

@@ -13,6 +13,7 @@ from improvo.odometry.settings import VerdictSettings
 from improvo.types import Float64
 
 _SIGMAS = 5.0  # standard errors that a deviation of the focal length must exceed
+_SIGMAS_OF_GROWTH = 8.0  # its change within a window, which a step ahead imitates; 6.7 at most in right recordings
 _LARGEST_LENS_ERROR = 0.06  # of the logarithm of a focal length; a window that knows it less well says nothing of it
 RIGHT, DOUBTFUL, NOT_JUDGED = "right", "doubtful", "not judged"
 
@@ -87,15 +88,19 @@ def joined(first: Verdict, second: Verdict, scale_error: float) -> Verdict:
 def estimated_error(spread: Spread, settings: VerdictSettings) -> float:
     """Error of the segment's positions after Sim3, % of its path.
 
-    The root sum of squares of what the parts' paths differ by, and of what the least certain change of scale moves.
+    The root sum of squares of what the paths of the parts differ by, and of what the least certain change of scale
+    moves. Of the two halves of the points the better one counts twice: the other can have too few by chance. Unusual
+    noise is worse than its spread: what does not fit is dropped, so what stays agrees with what is wrong.
     """
+    noise = np.nan_to_num(spread.noise_px) / (settings.usual_noise * spread.width)
+    quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
     scale = settings.scale_share * float(_scale_errors(spread).max(initial=0.0))
-    return float(np.hypot(np.linalg.norm(spread.error_percent), scale))
+    return float(max(noise, 1.0) * np.sqrt((quarters**2).sum() + len(HALVES) * halves.min() ** 2 + scale**2))
 
 
 def _scale_errors(spread: Spread) -> Float64:
-    """(L,) disagreement of the parts about the change of scale across each link, standard deviation of its log."""
-    return np.asarray(np.sqrt((spread.scale_steps**2).mean(axis=1)), np.float64)
+    """(L,) how much the parts change the scale across each link, median of the absolute logarithms."""
+    return np.asarray(np.median(np.abs(spread.scale_steps), axis=1), np.float64)
 
 
 def _lens_alarms(spread: Spread, settings: VerdictSettings) -> tuple[str, ...]:
@@ -108,7 +113,7 @@ def _lens_alarms(spread: Spread, settings: VerdictSettings) -> tuple[str, ...]:
     sure = [each for each in spread.lens if each.offset_error < _LARGEST_LENS_ERROR]
     for each in spread.lens:
         first, last = each.frames
-        if abs(each.growth) > max(settings.max_focal_change, _SIGMAS * each.growth_error):
+        if abs(each.growth) > max(settings.max_focal_change, _SIGMAS_OF_GROWTH * each.growth_error):
             alarms.append(_told(first, last, f"changes by {100 * abs(np.expm1(each.growth)):.0f} %"))
     for each in sure:
         first, last = each.frames
@@ -141,6 +146,8 @@ def _in_words(spread: Spread, error: float, settings: VerdictSettings) -> str:
     quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
     worst = int(np.argmax(quarters))
     words = f"estimated error {error:.1f} % of the path: "
+    if spread.noise_px > 1.5 * settings.usual_noise * spread.width:
+        words += f"the points are {spread.noise_px:.1f} pixels off, and "
     scale = float(_scale_errors(spread).max(initial=0.0))
     if settings.scale_share * scale > float(np.linalg.norm(spread.error_percent)):
         first, last = spread.link_frames[int(np.argmax(_scale_errors(spread)))].tolist()

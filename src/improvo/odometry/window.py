@@ -66,7 +66,7 @@ def adjust(
     """
     views = [*free, *fixed]
     is_fixed = np.arange(len(views)) >= len(free)
-    observations = _gather(views, len(free), store)
+    observations = _gather(views, len(free))
     if len(observations.camera) == 0:
         return WindowReport(float("nan"), 0, 0, 0)
     result = _solve(views, is_fixed, observations, store, K, objective, solver)
@@ -77,7 +77,7 @@ def adjust(
     dropped = int(bad.sum())
     _drop(views, observations, bad)
     if dropped > _WORTH_SOLVING_AGAIN * len(bad):
-        observations = _gather(views, len(free), store)
+        observations = _gather(views, len(free))
         result = _solve(views, is_fixed, observations, store, K, objective, solver)
         iterations += result.iterations
         bad = _misfits(result, max_error)
@@ -92,20 +92,25 @@ def _misfits(result: BundleResult, max_error: float) -> Mask:
     return (result.errors > max_error) | (result.depths <= 0.0)
 
 
-def _gather(views: Sequence[View], free_count: int, store: PointStore) -> _Observations:
+def _gather(views: Sequence[View], free_count: int) -> _Observations:
     """Observations of the points that at least one free view and two views in all observe."""
     rows = [view.observed for view in views]
     camera = np.repeat(np.arange(len(views)), [len(r) for r in rows])
     row = np.concatenate(rows)
     point = np.concatenate([view.points[r] for view, r in zip(views, rows, strict=True)])
-    times_seen = np.bincount(point, minlength=store.count)
-    seen_free = np.bincount(point[camera < free_count], minlength=store.count)
+    if len(point) == 0:
+        return _Observations(camera, row, point, point)
+    oldest = int(point.min())  # counted from here, the cost does not grow with the points of the whole recording
+    point = point - oldest
+    size = int(point.max()) + 1
+    times_seen = np.bincount(point, minlength=size)
+    seen_free = np.bincount(point[camera < free_count], minlength=size)
     use = (times_seen >= 2) & (seen_free >= 1)
     kept = use[point]
     ids = np.flatnonzero(use)
-    index = np.full(store.count, -1)
+    index = np.full(size, -1)
     index[ids] = np.arange(len(ids))
-    return _Observations(camera[kept], row[kept], index[point[kept]], ids)
+    return _Observations(camera[kept], row[kept], index[point[kept]], ids + oldest)
 
 
 def _solve(

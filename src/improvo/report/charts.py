@@ -8,16 +8,17 @@ import numpy as np
 
 from improvo.types import Float64
 
-_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 900, 150, 52, 22, 8
+_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 900, 190, 52, 40, 22
 
 
-def line_chart(x: Float64, y: Float64, label: str, most: float | None = None) -> str:
+def line_chart(x: Float64, y: Float64, label: str, most: float | None = None, across_of: str = "frame") -> str:
     """An SVG of `y` over `x` (NaN leaves a gap), from zero to the largest value or `most`.
 
     Args:
         x, y: (N,).
-        label: said to screen readers.
+        label: title of the upright axis, said to screen readers too.
         most: the upper end of the scale; values beyond are cut.
+        across_of: title of the other axis.
     """
     known = np.isfinite(y)
     top = most or (float(y[known].max()) if known.any() else 1.0) or 1.0
@@ -35,7 +36,11 @@ def line_chart(x: Float64, y: Float64, label: str, most: float | None = None) ->
     columns = np.arange(left, right + 1) if right - left < 6 else np.linspace(left, right, 6)
     for value in columns:
         column = (value - left) / max(right - left, 1e-12) * (_WIDTH - _LEFT - 8) + _LEFT
-        parts.append(f'<text x="{column:.1f}" y="{_HEIGHT - 5}" text-anchor="middle">{value:.0f}</text>')
+        anchor = "end" if value == columns[-1] and len(columns) > 1 else "middle"  # the last one ends with the line
+        parts.append(f'<text x="{column:.1f}" y="{_HEIGHT - 23}" text-anchor="{anchor}">{value:.0f}</text>')
+    middle = (_WIDTH + _LEFT) / 2
+    parts.append(f'<text x="{middle:.0f}" y="{_HEIGHT - 6}" text-anchor="middle">{escape(across_of)}</text>')
+    parts.append(f'<text x="0" y="12">{escape(label)}</text>')
     breaks = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
     for first, end in zip(breaks[::2], breaks[1::2], strict=True):
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across[first:end], up[first:end], strict=True))

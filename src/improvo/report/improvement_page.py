@@ -141,7 +141,7 @@ def _curves(page: Page, measures: Sequence[Measure], rounds: Sequence[Round]) ->
     x = np.arange(len(rounds), dtype=np.float64)
     for measure in measures[:4]:
         y = np.array([entry.values.get(measure.name, np.nan) for entry in rounds])
-        chart = line_chart(x, y, f"{measure.name} over the rounds")
+        chart = line_chart(x, y, measure.name, across_of="round")
         page.html(f"<figure>{chart}<figcaption>{plain(measure.name)} over the rounds.</figcaption></figure>")
 
 
@@ -152,5 +152,5 @@ def _losses(page: Page, entry: Round) -> None:
         return
     page.heading(f"Training of {entry.name}")
     for name in names:
-        chart = line_chart(np.array(entry.losses["step"]), np.array(entry.losses[name]), f"{name} over the steps")
+        chart = line_chart(np.array(entry.losses["step"]), np.array(entry.losses[name]), name, across_of="step")
         page.html(f"<figure>{chart}<figcaption>Loss over the steps: {plain(name)}.</figcaption></figure>")

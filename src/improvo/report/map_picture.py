@@ -13,6 +13,7 @@ from improvo.files import written_atomically
 from improvo.odometry.run_folder import RunFolder
 from improvo.report.overhead import overhead_axes, robust_limits
 from improvo.report.palettes import PALETTES, Palette
+from improvo.report.true_path import TruePath, true_path
 from improvo.types import SparseMap, UInt8
 
 _BACKGROUND = "#565b63"  # neither the paper's black (last window) nor its white (points)
@@ -93,6 +94,20 @@ def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: in
             f"segment {number}", first, (6, -12), textcoords="offset points", color="white", fontsize=8, zorder=7
         )
 
+    truth = true_path(run)
+    if truth is not None:
+        true_2d = axes_of_world.project(truth.centers)
+        for number in np.unique(trajectory.segment):
+            axis.plot(
+                *np.where((trajectory.segment == number)[:, None], true_2d, np.nan).T,
+                color="#7fffd4",
+                linewidth=1.3,
+                linestyle=(0, (4, 2)),
+                zorder=8,
+                label="true path, aligned" if number == trajectory.segment[0] else None,
+            )
+        axis.legend(loc="best", fontsize=8, facecolor=_BACKGROUND, labelcolor="white", framealpha=0.8)
+
     axis.set_xlim(low[0], high[0])
     axis.set_ylim(low[1], high[1])
     axis.set_aspect("equal")
@@ -101,7 +116,7 @@ def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: in
     unit = "metres" if run.unit.startswith("metres") else "map units: the first median depth is 1"
     axis.set_xlabel(f"right of the first camera ({unit})", fontsize=8)
     axis.set_ylabel("ahead of the first camera", fontsize=8)
-    axis.set_title(_title(run, len(shown), int((~inside).sum())), fontsize=10)
+    axis.set_title(_title(run, len(shown), int((~inside).sum()), truth), fontsize=10)
     _time_bar(figure, axis, palette, run.frames, len(last))
     png = io.BytesIO()
     figure.savefig(png, dpi=150, format="png", bbox_inches="tight", metadata={"Software": None})
@@ -121,7 +136,7 @@ def map_colours(sparse_map: SparseMap) -> UInt8:
     return np.rint(_DARKEST + (255 - _DARKEST) / 255.0 * sparse_map.rgb).astype(np.uint8)
 
 
-def _title(run: RunFolder, points: int, outside: int) -> str:
+def _title(run: RunFolder, points: int, outside: int, truth: TruePath | None) -> str:
     frames, segments = run.report["frames"], run.report["segments"]
     parts = [
         f"{frames['tracked']} of {frames['processed']} frames have a pose",
@@ -129,6 +144,8 @@ def _title(run: RunFolder, points: int, outside: int) -> str:
     ]
     if outside:
         parts.append(f"{outside} far ones outside the picture")
+    if truth is not None:
+        parts.append(f"{truth.text} off the true one")
     if (run.doubtful | run.uncertain).any():
         parts.append("doubtful where the band is pink")
     if len(segments) > 1:

@@ -14,6 +14,7 @@ from improvo.odometry.run_folder import RunFolder
 from improvo.report.map_picture import LAST_POSES, map_colours, trusted_points
 from improvo.report.overhead import overhead_axes, robust_limits
 from improvo.report.palettes import Palette
+from improvo.report.true_path import TruePath
 from improvo.stability.rule import IGNORE
 from improvo.types import Float64, UInt8
 
@@ -24,8 +25,8 @@ _FLOW = 5  # frames behind each point
 _JUMP_SHARE = 0.06  # of the image width; longer links are not drawn
 
 
-def scene_data(run: RunFolder, palette: Palette) -> dict[str, Any]:
-    """The 3D scene: layers of coloured points, poses, and where to look from first; z is up."""
+def scene_data(run: RunFolder, palette: Palette, truth: TruePath | None = None) -> dict[str, Any]:
+    """The 3D scene: layers of coloured points, poses, the true path, and where to look from first; z is up."""
     trajectory = run.trajectory
     axes = overhead_axes(trajectory.world_from_cam)
     scene_from_world = np.stack([axes.right, axes.forward, -axes.down])
@@ -49,6 +50,7 @@ def scene_data(run: RunFolder, palette: Palette) -> dict[str, Any]:
             "labels": _layer(label_points, palette.label_colours(run.points.stability[label_rows])),
         },
         "poses": _base64(poses.astype("<f4")),
+        "truth": None if truth is None else _base64((truth.centers @ scene_from_world.T).astype("<f4")),
         "frame_indices": run.frame_indices.tolist(),
         "segments": trajectory.segment.tolist(),
         "doubted": (run.doubtful | run.uncertain).tolist(),

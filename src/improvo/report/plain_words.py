@@ -30,7 +30,7 @@ def warnings(report: dict[str, Any], shown: Int64, brightness: Float64, median_e
         lines.append(
             "No frame has a pose: the camera moved too little, only turned, or saw too little texture. Move sideways."
         )
-    lines += [f"{line[0].upper()}{line[1:]}." for line in verdict_lines(report) if f" is {DOUBTFUL}" in line]
+    lines += [f"{line[0].upper()}{line[1:]}." for line in verdict_lines(report, only=DOUBTFUL)]
     lines += _events(report)
     if frames["lost"]:
         lines.append(f"{frames['lost']} of {frames['processed']} frames have no pose: {ranges(frames['lost_frames'])}.")

@@ -18,6 +18,7 @@ from improvo.report.page import Page
 from improvo.report.page_data import frames_data, per_frame, scene_data
 from improvo.report.palettes import PALETTES, Palette
 from improvo.report.plain_words import warnings
+from improvo.report.true_path import TruePath, true_path
 
 _MAX_FRAMES = 150  # of the slider
 _FRAME_WIDTH = 480
@@ -28,11 +29,13 @@ _SCENE = """
 <label><input type="radio" name="layer" value="labels"> points by label</label>
 <button type="button" id="scene-reset">Reset</button><button type="button" id="scene-above">From above</button>
 <span class="legend">trajectory: first <i class="ramp" style="background:{gradient}"></i> last; black: last window;
-pink: doubtful; yellow: the frame below</span></div>
+pink: doubtful; yellow: the frame below{truth}</span></div>
 <canvas class="scene" id="scene" tabindex="0" aria-label="3D map: drag to turn, shift-drag to move, wheel to zoom">
 </canvas>
 <p class="note only-screen">Drag turns, shift or right button moves, the wheel zooms after a click on the map, two
 fingers zoom and move; arrow keys and + - too. One finger up or down scrolls the page.</p>"""
+
+_TRUTH = '; <i class="swatch" style="background:#7fffd4"></i> true path, each segment aligned'
 
 _FRAMES = """
 <div class="controls only-screen"><button type="button" id="frame-play">Play</button>
@@ -70,6 +73,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
         f"frontend {report['frontend']}; poses and map are {run.unit}.",
     )
     tracks = run.points.counts()
+    truth = true_path(run)
     page.tiles(
         [
             (f"{frames['tracked']} of {frames['processed']}", "frames with a pose"),
@@ -77,6 +81,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
             *_verdict_tile(report),
             (f"{report['points']:,}", "map points"),
             *([(f"{_path_length(run):.4g} m", "path of the camera")] if report.get("metric") else []),
+            *([(f"{truth.ate_percent:.2g} %", "of the path off the true one (ATE)")] if truth is not None else []),
             (f"{median_error:.2f} px" if np.isfinite(median_error) else "-", "median re-projection error"),
             (f"{report['frames_per_second']:g}", "frames per second"),
             (f"{tracks['stable']:,} / {tracks['unstable']:,}", "stable / unstable tracks"),
@@ -86,7 +91,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
     page.warnings(warnings(report, shown, brightness, median_error), "Nothing: every frame has a pose, in one segment.")
     page.paragraph(" ".join(f"{line[0].upper()}{line[1:]}." for line in verdict_lines(report)))
     if len(run.trajectory):
-        _map_section(page, run, palette)
+        _map_section(page, run, palette, truth)
     _frames_section(page, run, data, palette, missing)
     _charts_section(page, run)
     _labels_section(page, run)
@@ -110,10 +115,10 @@ def _path_length(run: RunFolder) -> float:
     return float(steps[np.diff(run.trajectory.segment) == 0].sum())
 
 
-def _map_section(page: Page, run: RunFolder, palette: Palette) -> None:
+def _map_section(page: Page, run: RunFolder, palette: Palette, truth: TruePath | None) -> None:
     page.heading("Map and trajectory")
-    page.html(_SCENE.format(gradient=_gradient(palette)))
-    page.script("scene.js", "scene-data", scene_data(run, palette))
+    page.html(_SCENE.format(gradient=_gradient(palette), truth=_TRUTH if truth is not None else ""))
+    page.script("scene.js", "scene-data", scene_data(run, palette, truth))
     colours = "from blue to red" if palette.name == "paper" else "from dark to bright"
     page.picture(
         map_png(run, palette),
@@ -166,7 +171,7 @@ def _charts_section(page: Page, run: RunFolder) -> None:
 
     errors = per_frame(run, middle)
     page.html(
-        f"<figure>{line_chart(x, errors, 'median re-projection error per frame')}<figcaption>Median re-projection "
+        f"<figure>{line_chart(x, errors, 'median re-projection error, px')}<figcaption>Median re-projection "
         "error per frame in pixels, of all raw tracks under the final poses; a gap where there is no pose.</figcaption>"
         "</figure>"
     )
@@ -183,6 +188,11 @@ def _labels_section(page: Page, run: RunFolder) -> None:
     names = ("stable", "unstable", "ignore", "withheld")
     rows = [(name, float(tracks[name]), f"{tracks[name]:,}") for name in names]
     page.bars(("label", "tracks"), rows)
+    page.paragraph(
+        "Ignore: too short, or in between stable and unstable, so it teaches nothing. Withheld: it had a label, which "
+        "the quality gate took away, because the odometry is not to be trusted where the track was seen.",
+        note=True,
+    )
 
 
 def _timing_section(page: Page, run: RunFolder) -> None:

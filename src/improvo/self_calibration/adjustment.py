@@ -87,7 +87,7 @@ def adjust(scene: Scene, iterations: int = _ITERATIONS) -> Scene:
         if not improved or candidate is None:
             break
         decrease, cost, scene = (cost - new) / cost, new, candidate
-        damping = max(damping / 5.0, 1e-12)
+        damping = max(damping / 5.0, 1e-8)
         if decrease < _RELATIVE_DECREASE:
             break
     return scene
@@ -119,7 +119,10 @@ def covariance(scene: Scene) -> Float64:
     poses = reduced[:size, :size] + _held_scale(scene, reduced)
     # the world may lie anywhere, and a view may have lost all its observations: the lens does not depend on either
     poses = poses + np.diag(1e-9 * (np.diag(poses) + np.diag(poses).mean()))
-    with_lens = scipy.linalg.solve(poses, reduced[:size, size:], assume_a="pos").reshape(views, 6, 7)
+    try:
+        with_lens = scipy.linalg.cho_solve(scipy.linalg.cho_factor(poses), reduced[:size, size:]).reshape(views, 6, 7)
+    except (np.linalg.LinAlgError, ValueError):
+        return np.full((7, 7), np.inf)
     # what a change of the lens does to each pixel after views and points have followed it as far as they can
     effect = by_value - by_pose @ with_lens[scene.view]
     pull = np.zeros((len(scene.xyz), 3, 7))
@@ -230,7 +233,7 @@ def _stepped(scene: Scene, system: tuple[Float64, ...], first: Int64, damping: f
     diagonal = np.diag(reduced).copy()
     reduced[np.diag_indices_from(reduced)] += damping * diagonal + 1e-12
     try:
-        step = scipy.linalg.solve(reduced, right, assume_a="pos")
+        step = scipy.linalg.cho_solve(scipy.linalg.cho_factor(reduced), right)
     except (np.linalg.LinAlgError, ValueError):
         return None
     if not np.isfinite(step).all():

@@ -16,13 +16,11 @@ from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.self_calibration.adjustment import Scene
 from improvo.self_calibration.lens import Lens
 from improvo.self_calibration.raw_features import Piece
-from improvo.self_calibration.rejoining import SceneView
 from improvo.sequences.rectification import Rectifier
-from improvo.tracking.matching import distance_threshold, unit_descriptors
-from improvo.types import Features, Float32, Float64, Int64, Mask, SparseMap, UInt8
+from improvo.types import Features, Float64, Int64, Mask, SparseMap, UInt8
 
 _WORLDS = 100_000  # more than a piece has segments
-_STEP = 0.03  # motion of the median point between two selected views, as a share of the width
+_STEPS = (0.03, 0.015, 0.008)  # motion of the median point between two views, shares of the width; until enough
 
 
 @dataclass(frozen=True)
@@ -31,8 +29,6 @@ class TrackedPiece:
 
     views: list[FinalView]  # with a pose, in temporal order
     pixels: list[Float64]  # (N, 2) raw pixels of the keypoints of each view
-    descriptors: list[Float32]  # (N, D) unit vectors of each view
-    max_distance: float  # of descriptors of the same spot
     map: SparseMap
 
 
@@ -62,14 +58,11 @@ def track_piece(
     odometry.finish()
     views = sorted((view for view in final if view.segment >= 0), key=lambda view: view.frame_index)
     pixels = [piece.features[view.frame_index].keypoints[kept[view.frame_index]].astype(np.float64) for view in views]
-    distance = distance_threshold(piece.features[0], settings.matching.max_distance)
-    taken = [piece.features[view.frame_index].take(kept[view.frame_index]) for view in views]
-    return TrackedPiece(views, pixels, [unit_descriptors(features) for features in taken], distance, odometry.map)
+    return TrackedPiece(views, pixels, odometry.map)
 
 
-def scene_of(pieces: list[TrackedPiece], lens: Lens, max_views: int) -> tuple[Scene, list[SceneView]]:
-    """Views that differ, and the points that at least three of them see, as one scene of one lens; and all that the
-    views saw.
+def scene_of(pieces: list[TrackedPiece], lens: Lens, max_views: int) -> Scene:
+    """Views that differ, and the points that at least three of them see, as one scene of one lens.
 
     Pieces and segments of the odometry share no point; each has a world of its own.
 
@@ -78,8 +71,11 @@ def scene_of(pieces: list[TrackedPiece], lens: Lens, max_views: int) -> tuple[Sc
         lens: where the adjustment starts from.
         max_views: of all pieces together.
     """
-    chosen = [_different_views(piece, lens.width) for piece in pieces]
-    total = sum(map(len, chosen))
+    for step in _STEPS:
+        chosen = [_different_views(piece, step * lens.width) for piece in pieces]
+        total = sum(map(len, chosen))
+        if total > max_views / 2:
+            break
     chosen = [
         rows[np.unique(np.linspace(0, len(rows) - 1, max(2, round(len(rows) * max_views / total))).astype(int))]
         if total > max_views and len(rows)
@@ -88,7 +84,7 @@ def scene_of(pieces: list[TrackedPiece], lens: Lens, max_views: int) -> tuple[Sc
     ]
     poses: list[Float64] = []
     motions: list[Float64] = []
-    views: list[SceneView] = []
+    worlds: list[int] = []
     xyz, view_of, point_of, pixels = [], [], [], []
     points_before = 0
     for number, (piece, rows) in enumerate(zip(pieces, chosen, strict=True)):
@@ -105,8 +101,7 @@ def scene_of(pieces: list[TrackedPiece], lens: Lens, max_views: int) -> tuple[Sc
             pixels.append(piece.pixels[row][seen])
             poses.append(se3.inverse(view.world_from_cam))
             motions.append(_motion(piece.views, row))
-            world = _WORLDS * number + view.segment
-            views.append(SceneView(piece.pixels[row], piece.descriptors[row], piece.max_distance, world))
+            worlds.append(_WORLDS * number + view.segment)
         xyz.append(piece.map.xyz[order])
         points_before += len(ids)
     point = np.concatenate(point_of)
@@ -119,10 +114,10 @@ def scene_of(pieces: list[TrackedPiece], lens: Lens, max_views: int) -> tuple[Sc
         view[order].astype(np.int64),
         point[order].astype(np.int64),
         np.concatenate(pixels)[order],
-        np.array([view.world for view in views]),
+        np.array(worlds),
         np.array(motions),
     )
-    return scene.without(np.zeros(len(view), bool)), views
+    return scene.without(np.zeros(len(view), bool))
 
 
 def _motion(views: list[FinalView], row: int) -> Float64:
@@ -141,8 +136,8 @@ def _motion(views: list[FinalView], row: int) -> Float64:
     return np.concatenate([last_from_first[:3, 3], turn]) / seconds
 
 
-def _different_views(piece: TrackedPiece, width: int) -> Int64:
-    """Rows of views, each of which moved by a share of the picture since the one before."""
+def _different_views(piece: TrackedPiece, step: float) -> Int64:
+    """Rows of views, each of which moved by so many pixels since the one before."""
     chosen: list[int] = []
     for row, view in enumerate(piece.views):
         if not chosen or view.segment != piece.views[chosen[-1]].segment:
@@ -152,7 +147,7 @@ def _different_views(piece: TrackedPiece, width: int) -> Int64:
         _, here, there = np.intersect1d(view.points, last.points, return_indices=True)
         seen = view.points[here] >= 0
         moved = np.linalg.norm(piece.pixels[row][here[seen]] - piece.pixels[chosen[-1]][there[seen]], axis=1)
-        if len(moved) == 0 or float(np.median(moved)) > _STEP * width:
+        if len(moved) == 0 or float(np.median(moved)) > step:
             chosen.append(row)
     return np.array(chosen, np.int64)
 

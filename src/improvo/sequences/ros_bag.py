@@ -132,7 +132,7 @@ class RosBag(Recording):
         order, _ = increasing_order(stamps)
         row = nearest(self.times, stamps[order])
         without = int((row < 0).sum())
-        notes = [f"{self.path}: {without} of {len(row)} images have no depth within 0.02 s"] if without else []
+        notes = [f"{self.path}: depth for {len(row) - without} of {len(row)} images (within 0.02 s)"] if without else []
         return stream, np.where(row >= 0, order[np.maximum(row, 0)], -1), notes
 
 

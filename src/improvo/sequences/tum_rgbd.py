@@ -51,7 +51,9 @@ class TumRgbd(Recording):
             notes += depth_notes
             without = int((self._depth_row < 0).sum())
             if without:
-                notes.append(f"{path}: {without} of {len(self.times)} images have no depth within 0.02 s")
+                notes.append(
+                    f"{path}: depth for {len(self.times) - without} of {len(self.times)} images (within 0.02 s)"
+                )
         if (path / "groundtruth.txt").is_file():
             self.ground_truth, problems = read_trajectory_report(path / "groundtruth.txt")
             notes += problems

@@ -10,11 +10,12 @@ MANY_SEGMENTS = 10
 
 
 def sub_trajectory_table(results: dict[str, dict[str, Any]], unit: str = "s") -> str:
-    """Table 2: mean rotation and translation error per sub-trajectory length, one row per run, best in bold.
+    """Table 2: mean rotation and translation error per sub-trajectory length, best in bold.
 
     Args:
         results: name of the row -> trajectory errors as plain data (`trajectory.json`).
-        unit: of the lengths: "s", "m" or "path".
+        unit: of the lengths: "s", as in the paper with a row for each run, or "m" or "path", of which there are more
+            and which have a row for each run and length.
     """
     first = next(iter(results.values()))
     lengths = [row["length"] for row in first["relative"] if row["unit"] == unit]
@@ -22,27 +23,53 @@ def sub_trajectory_table(results: dict[str, dict[str, Any]], unit: str = "s") ->
         return ""
     windows = {name: [r for r in result["relative"] if r["unit"] == unit] for name, result in results.items()}
     shown = [_length(length, unit) for length in lengths]
+    notes = {f"- {name}: {row['note']}" for name, rows in windows.items() for row in rows if row["note"]}
+    table = _by_time(windows, shown) if unit == "s" else _by_length(windows, shown)
+    return "\n\n".join([table, *(["\n".join(sorted(notes))] if notes else [])])
+
+
+def _by_time(windows: dict[str, list[dict[str, Any]]], shown: list[str]) -> str:
+    """A row for each run; the lengths beside each other."""
     header = ["Sub-trajectory length", *(f"{s} (°)" for s in shown), *(f"{s} (cm)" for s in shown)]
-    if unit != "s":
-        header += [f"{s} (%)" for s in shown]
     none = ["No prediction"]
     columns: list[list[str]] = []
     fields = [("rotation_deg", 1.0), ("translation_m", 100.0)]
     for field, factor in fields:
-        for i in range(len(lengths)):
+        for i in range(len(shown)):
             still = _first_known([rows[i][f"no_prediction_{field}"] for rows in windows.values()])
             none.append(significant(None if still is None else factor * still))
             values = [factor * rows[i][field]["mean"] if rows[i][field] else None for rows in windows.values()]
             cells = [significant(value) for value in values]
             columns.append(bold_best(cells, values, largest=False) if len(values) > 1 else cells)
-    if unit != "s":
-        for i in range(len(lengths)):
-            none.append("")
-            shares = [rows[i]["translation_percent"] for rows in windows.values()]
-            columns.append([significant(share) for share in shares])
-    notes = {f"- {name}: {row['note']}" for name, rows in windows.items() for row in rows if row["note"]}
-    table = markdown(header, [none, *columns_to_rows(list(results), columns)])
-    return "\n\n".join([table, *(["\n".join(sorted(notes))] if notes else [])])
+    return markdown(header, [none, *columns_to_rows(list(windows), columns)])
+
+
+def _by_length(windows: dict[str, list[dict[str, Any]]], shown: list[str]) -> str:
+    """A row for each run and length, with the error of no prediction at the same lengths."""
+    header = [
+        "Sub-trajectory length",
+        "rot. (°)",
+        "transl. (cm)",
+        "transl. (%)",
+        "none: rot. (°)",
+        "none: transl. (cm)",
+    ]
+    rows = []
+    for i, length in enumerate(shown):
+        for name, entries in windows.items():
+            entry = entries[i]
+            rotation, translation = entry["rotation_deg"], entry["translation_m"]
+            still = entry["no_prediction_translation_m"]
+            figures = [
+                rotation["mean"] if rotation else None,
+                100 * translation["mean"] if translation else None,
+                entry["translation_percent"],
+                entry["no_prediction_rotation_deg"],
+                None if still is None else 100 * still,
+            ]
+            label = length if len(windows) == 1 else f"{length}, {name}"
+            rows.append([label, *map(significant, figures)])
+    return markdown(header, rows)
 
 
 def trajectory_tables(result: dict[str, Any], name: str) -> str:

@@ -10,6 +10,7 @@
     [name, { xyz: floats(layer.xyz), rgb: bytes(layer.rgb) }]));
   const poses = floats(data.poses); // 12 a pose: centre, then the camera's x, y and z axes
   const count = poses.length / 12;
+  const truth = data.truth ? floats(data.truth) : null; // 3 a pose, NaN without one
   const context = canvas.getContext("2d");
   const start = { yaw: -0.5, pitch: 0.85, distance: 1.6 * data.radius, centre: [...data.centre] };
   const view = { ...start, centre: [...start.centre] };
@@ -81,6 +82,14 @@
     }
   }
 
+  function drawTruth(project, scale) {
+    for (let i = 1; truth && i < count; i++) {
+      const [from, to] = [i - 1, i].map((k) => [truth[3 * k], truth[3 * k + 1], truth[3 * k + 2]]);
+      if (data.segments[i] === data.segments[i - 1] && !Number.isNaN(from[0] + to[0]))
+        line(project, from, to, "#7fffd4", 1.3 * scale);
+    }
+  }
+
   function drawCamera(project, scale) {
     const p = poses.subarray(12 * current, 12 * current + 12);
     const size = 0.07 * data.radius;
@@ -106,6 +115,7 @@
     const project = projector(width, height);
     drawPoints(width, height, project);
     drawPath(project, scale);
+    drawTruth(project, scale);
     if (count) drawCamera(project, scale);
     canvas.dataset.yaw = view.yaw.toFixed(3);
     canvas.dataset.distance = view.distance.toFixed(4);

@@ -1,0 +1,55 @@
+"""The true trajectory beside the estimate, in the estimate's own world, where the recording has one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from improvo.errors import InputError
+from improvo.geometry.alignment import align_points
+from improvo.odometry.run_folder import RunFolder
+from improvo.types import Float64
+
+_FEWEST = 3  # poses of a segment that an alignment needs
+
+
+@dataclass(frozen=True)
+class TruePath:
+    """True camera centers, one row for each pose of the run, each segment aligned on its own (rotation, scale)."""
+
+    centers: Float64  # (N, 3) in the world of the run, NaN where there is no truth
+    errors: Float64  # (N,) distance of the estimate, in the run's unit
+    ate_percent: float  # root mean square of the errors over the length of the true path
+
+    @property
+    def text(self) -> str:
+        """The error in words."""
+        return f"{self.ate_percent:.2g} % of the path"
+
+
+def true_path(run: RunFolder) -> TruePath | None:
+    """The true path of a run; None where the recording has none, or is not there any more."""
+    trajectory = run.trajectory
+    try:
+        truth = run.sequence.ground_truth
+    except InputError:
+        return None
+    if truth is None or len(trajectory) == 0:
+        return None
+    rows = np.searchsorted(run.sequence.indices, np.array(run.source_index)[run.frame_indices])
+    wanted = truth.camera_centers[np.minimum(rows, len(truth) - 1)]
+    centers = np.full_like(wanted, np.nan)
+    known = np.isfinite(wanted).all(axis=1)
+    for segment in np.unique(trajectory.segment).tolist():
+        here = np.flatnonzero((trajectory.segment == segment) & known)
+        estimate = trajectory.camera_centers[here]
+        if len(here) < _FEWEST or np.ptp(wanted[here], axis=0).max() == 0 or np.ptp(estimate, axis=0).max() == 0:
+            continue
+        centers[here] = align_points(estimate, wanted[here], with_scale=True).apply(wanted[here])
+    errors = np.linalg.norm(trajectory.camera_centers - centers, axis=1)
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)[np.diff(trajectory.segment) == 0]
+    length = float(np.nansum(steps))
+    if not np.isfinite(errors).any() or length == 0:
+        return None
+    return TruePath(centers, errors, 100.0 * float(np.sqrt(np.nanmean(errors**2))) / length)

@@ -1,0 +1,149 @@
+"""The verdict: estimate, alarms, the lens, joined segments, and how run.json tells of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from simulated_features import CAMERA, hand_motion, room
+
+from improvo.backend.settings import ObjectiveSettings
+from improvo.errors import ConfigError
+from improvo.geometry import se3
+from improvo.odometry.evidence import PARTS, Spread
+from improvo.odometry.evidence_window import EvidenceKeyframe, EvidenceWindow
+from improvo.odometry.lens_evidence import LensMeasure, measured_lens
+from improvo.odometry.settings import VerdictSettings
+from improvo.odometry.told_verdicts import doubtful_frames, uncertain_frames, verdict_lines
+from improvo.odometry.verdict import DOUBTFUL, NOT_JUDGED, RIGHT, Verdict, estimated_error, joined, judge
+from improvo.types import Float64
+
+SETTINGS = VerdictSettings()
+GOOD = Spread(
+    error_percent=np.full(len(PARTS), 0.3),
+    scale_steps=np.full((2, len(PARTS)), 0.01),
+    link_frames=np.array([[0, 20], [10, 30]]),
+    noise_px=0.3,
+    width=640,
+    fewest=100,
+    keyframes=24,
+)
+
+
+def changed(**changes: Any) -> Verdict:
+    return judge(replace(GOOD, **changes), SETTINGS)
+
+
+def test_a_good_spread_is_right_and_says_what_the_estimate_rests_on() -> None:
+    verdict = judge(GOOD, SETTINGS)
+    assert verdict.word == RIGHT
+    assert verdict.error_percent == pytest.approx(np.sqrt(6 * 0.3**2 + (40 * 0.01) ** 2))
+    assert verdict.evidence[0].startswith("estimated error 0.8 % of the path: ")
+
+
+def test_each_kind_of_evidence_can_make_a_segment_doubtful() -> None:
+    quarter = changed(error_percent=np.array([5.5, 0.4, 0.3, 0.3, 0.2, 0.2]))
+    assert quarter.word == DOUBTFUL
+    assert "without the upper left quarter of the picture it differs by 5.5 %" in quarter.evidence[0]
+    scale = changed(scale_steps=np.array([[0.01] * 6, [0.2] * 6]))
+    assert scale.word == DOUBTFUL
+    assert "the scale between frames 10 and 30 is known to 20 % only" in scale.evidence[0]
+    assert scale.uncertain == ((10, 30),)
+    assert changed(error_percent=np.full(6, 2.5)).word == DOUBTFUL
+    alarmed = judge(GOOD, SETTINGS, ("two motions",))
+    assert (alarmed.word, alarmed.evidence[0]) == (DOUBTFUL, "two motions")
+    assert judge(None, SETTINGS).word == NOT_JUDGED
+    assert judge(None, SETTINGS, ("two motions",)).word == DOUBTFUL
+
+
+def test_a_half_of_the_points_that_is_bad_by_chance_does_not_count_and_noise_does() -> None:
+    unlucky = replace(GOOD, error_percent=np.array([0.3] * 5 + [9.0]))
+    assert estimated_error(unlucky, SETTINGS) == estimated_error(GOOD, SETTINGS)
+    noisy = replace(GOOD, noise_px=3.0 * SETTINGS.usual_noise * 640)
+    assert estimated_error(noisy, SETTINGS) == pytest.approx(3.0 * estimated_error(GOOD, SETTINGS))
+    assert "pixels off" in judge(noisy, SETTINGS).evidence[0]
+
+
+def test_a_lens_that_is_another_or_changes_is_an_alarm_where_it_is_known_well() -> None:
+    same = LensMeasure((0, 40), 0.01, 0.01, 0.02, 0.01)
+    assert changed(lens=(same, same)).word == RIGHT
+    for other in (
+        replace(same, offset=0.25),  # a wrong calibration
+        replace(same, offset=0.15),  # another than in the first window
+        replace(same, growth=-0.2),
+    ):
+        assert changed(lens=(same, other)).word == DOUBTFUL
+        assert "the focal length" in changed(lens=(same, other)).evidence[0]
+    unsure = replace(same, offset=0.25, offset_error=0.1, growth=0.3, growth_error=0.1)
+    assert changed(lens=(same, unsure)).word == RIGHT
+
+
+def window(growth: float, offset: float) -> EvidenceWindow:
+    """Twelve keyframes in a room, through a lens whose focal length is not the camera's."""
+    poses, xyz = se3.inverse(hand_motion(12, step=0.08, turn_deg=1.5)), room().points
+    rng = np.random.default_rng(1)
+    keyframes = []
+    for i, pose in enumerate(poses):
+        in_camera = se3.transform(pose, xyz)
+        pixels = CAMERA.project(in_camera)
+        inside = (pixels > 20).all(axis=1) & (pixels < (CAMERA.width - 20, CAMERA.height - 20)).all(axis=1)
+        rows = np.flatnonzero((in_camera[:, 2] > 0.1) & inside)[:250]
+        center: Float64 = CAMERA.K[:2, 2]
+        factor = np.exp(offset + growth * (i / 11 - 0.5))
+        seen = center + (pixels[rows] - center) * factor + rng.normal(scale=0.3, size=(len(rows), 2))
+        keyframes.append(EvidenceKeyframe(i, pose, seen, rows, np.ones(len(rows))))
+    return EvidenceWindow.of(keyframes, xyz)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.1, -0.12])
+def test_a_window_tells_its_focal_length(offset: float) -> None:
+    found = measured_lens(window(0.0, offset), (0, 11), CAMERA, ObjectiveSettings(depth_weight=0.0))
+    assert abs(found.offset - offset) < 0.04
+    assert abs(found.growth) < 0.04
+    assert 0.0 < found.offset_error < 0.02
+    assert 0.0 < found.growth_error < 0.02
+
+
+@pytest.mark.parametrize("growth", [0.12, -0.1])
+def test_a_window_tells_that_its_focal_length_changes(growth: float) -> None:
+    """How much is told too high: the poses that it starts from know nothing of the zoom."""
+    found = measured_lens(window(growth, 0.0), (0, 11), CAMERA, ObjectiveSettings(depth_weight=0.0))
+    assert 0.8 < found.growth / growth < 2.5
+    assert found.growth_error < 0.02
+
+
+def test_joined_stretches_take_the_worse_verdict_and_name_the_scale_between_them() -> None:
+    good, bad = judge(GOOD, SETTINGS), changed(error_percent=np.full(6, 3.0))
+    both = joined(good, bad, 0.01)
+    assert (both.word, both.error_percent) == (DOUBTFUL, bad.error_percent)
+    assert both.evidence[-1] == "joined, scale ±1 %"
+    assert joined(good, good, 0.04).error_percent == pytest.approx(2.0)
+    assert joined(good, Verdict(NOT_JUDGED), 0.01).word == RIGHT
+
+
+def test_run_json_has_no_nan_and_tells_frames_and_lines() -> None:
+    assert Verdict(NOT_JUDGED).report()["error_percent"] is None
+    verdict = changed(error_percent=np.full(6, 3.0), scale_steps=np.full((2, 6), 0.15))
+    segments = [
+        {"number": 0, "first": 0, "last": 9, "verdict": judge(GOOD, SETTINGS).report()},
+        {"number": 1, "first": 10, "last": 30, "verdict": verdict.report()},
+        {"number": 2, "first": 31, "last": 33},  # of a run before there were verdicts
+    ]
+    segment = np.array([0, 0, 1, 1, -1, 2])
+    assert doubtful_frames({"segments": segments}, segment).tolist() == [False, False, True, True, False, False]
+    assert uncertain_frames({"segments": segments}, np.array([5, 25, 31])).tolist() == [True, True, False]
+    lines = verdict_lines({"segments": segments})
+    assert [line.split(":")[0] for line in lines] == [
+        "segment 0 (frames 0 to 9) is right",
+        "segment 1 (frames 10 to 30) is doubtful",
+        "segment 2 (frames 31 to 33) is not judged",
+    ]
+    assert verdict_lines({"segments": segments}, only=DOUBTFUL) == lines[1:2]
+
+
+def test_wrong_settings_are_refused() -> None:
+    for wrong in ({"window": 3}, {"max_error": 0.0}, {"usual_noise": -1.0}):
+        with pytest.raises(ConfigError):
+            VerdictSettings(**wrong)  # type: ignore[arg-type]
