@@ -13,10 +13,16 @@ import sys
 from importlib.metadata import Distribution, distributions
 
 ALLOWED = re.compile(
-    r"apache|\bmit\b|bsd|\bisc\b|\bpsf\b|python software|mozilla|mpl|zlib|unlicense|public domain|\bcc0|hpnd|boost",
+    r"apache|\bmit\b|bsd|\bisc\b|\bpsf\b|python software|mozilla|mpl|zlib|unlicense|public domain|\bcc0|hpnd|boost"
+    r"|any.osi",
     re.IGNORECASE,
 )
-REFUSED = re.compile(r"(?<!l)gpl|affero|non.?commercial|\bnc\b|cc.by.nc|research only|proprietary", re.IGNORECASE)
+REFUSED = re.compile(
+    r"gpl|affero|general public|non.?commercial|\bnc\b|cc.by.nc|research only|proprietary", re.IGNORECASE
+)
+LESSER = re.compile(
+    r"(?:gnu )?(?:lesser general public license|library or lesser general)[^;,]*|lgpl[^\s;,]*", re.IGNORECASE
+)
 KNOWN = {  # whose metadata says nothing that a program can read; looked up by hand in the package itself
     "improvo": "Apache-2.0",
     "openvino": "Apache-2.0; binaries under the same",
@@ -34,11 +40,9 @@ def main() -> None:
         if name in SYSTEM:
             continue
         licence = KNOWN.get(name) or licence_of(package)
-        lesser = re.sub(r"lgpl\S*|lesser general[^;,]*", "", licence, flags=re.IGNORECASE)
-        dual = " or " in licence.lower() and ALLOWED.search(licence)
         if OWN_TERMS.match(name):
             verdict = "own terms"
-        elif dual or (ALLOWED.search(licence) and not REFUSED.search(lesser)):
+        elif may_depend_on(licence):
             verdict = "ok"
         else:
             verdict = "REFUSED"
@@ -46,6 +50,14 @@ def main() -> None:
         print(f"{verdict:10} {name:40} {package.version:18} {licence[:80]}")
     if bad:
         sys.exit(f"not to be depended on, or unknown: {', '.join(bad)}")
+
+
+def may_depend_on(licence: str) -> bool:
+    """Whether one of its terms, or all of them, are among those that we take; the lesser GPL is one."""
+    if " or " in licence.lower():
+        return any(may_depend_on(part) for part in re.split(r"\s+or\s+", licence, flags=re.IGNORECASE))
+    rest = LESSER.sub("", licence)
+    return bool(ALLOWED.search(rest) or rest != licence) and not REFUSED.search(rest)
 
 
 def licence_of(package: Distribution) -> str:

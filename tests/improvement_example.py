@@ -23,12 +23,13 @@ from improvo.improvement.improve import Improvement, improve
 from improvo.improvement.recipe import TrainingJob
 from improvo.improvement.settings import ImproveSettings, SplitSettings, ValidationSettings
 from improvo.odometry.settings import OdometrySettings, StartSettings
-from improvo.stability.settings import LabelSettings
+from improvo.stability.settings import LabelQualitySettings, LabelSettings
 
 SPOILED = "spoiled"  # stands for bundled weights with so much noise that a sixth of the matches is lost
 SETTINGS = ImproveSettings(
     frontend=FrontendSettings(SPOILED, max_keypoints=250),
-    labels=LabelSettings(min_observations=6),
+    # a dozen frames of one wall, by a spoiled network, are no evidence that the odometry is right
+    labels=LabelSettings(min_observations=6, quality=LabelQualitySettings(enabled=False)),
     odometry=OdometrySettings(start=StartSettings(max_homography_ratio=0.9)),  # the room is mostly one wall
     split=SplitSettings(0.3),
     validation=ValidationSettings(

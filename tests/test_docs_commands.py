@@ -34,7 +34,7 @@ def complete_lines(text: str) -> list[str]:
 
 def problem(line: str) -> str:
     """What the command line says of it; empty if nothing."""
-    words = shlex.split(line)[1:]
+    words = shlex.split(re.sub(r"\b[a-z0-9]+://", "", line))[1:]  # a location would be looked up
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):

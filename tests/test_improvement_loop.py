@@ -359,6 +359,9 @@ def test_better_is_more_right_matches_with_odometry_that_is_no_worse() -> None:
     assert is_better(validation(more, tracked=98), start, replace(settings, frames_lost=0.05))
     assert not is_better(validation(more, segments=2), start, settings)
     assert is_better(validation(more, segments=2), start, replace(settings, segments_more=1))
+    nothing = validation([0.4, 0.5, 0.6] * 5, tracked=0, segments=0)
+    assert is_better(validation(more), nothing, settings)  # one segment is no break more than none
+    assert not is_better(validation(more, segments=2), nothing, settings)
 
 
 def test_the_interval_of_a_gain_is_over_pairs() -> None:

@@ -54,6 +54,9 @@ def test_each_kind_of_evidence_can_make_a_segment_doubtful() -> None:
     assert changed(error_percent=np.full(6, 2.5)).word == DOUBTFUL
     alarmed = judge(GOOD, SETTINGS, ("two motions",))
     assert (alarmed.word, alarmed.evidence[0]) == (DOUBTFUL, "two motions")
+    assert judge(GOOD, SETTINGS, (), ("two motions",)).word == RIGHT
+    worse = replace(GOOD, error_percent=np.full(6, 1.2))
+    assert (judge(worse, SETTINGS).word, judge(worse, SETTINGS, (), ("two motions",)).word) == (RIGHT, DOUBTFUL)
     assert judge(None, SETTINGS).word == NOT_JUDGED
     assert judge(None, SETTINGS, ("two motions",)).word == DOUBTFUL
 

@@ -29,6 +29,7 @@ class Camera:
     distortion_model: str = "brown"  # or "fisheye" (Kannala-Brandt k1..k4), "fov" (Devernay-Faugeras w)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "distortion", tuple(self.distortion))  # from JSON it is a list, never equal to a tuple
         counts = DISTORTION_MODELS.get(self.distortion_model)
         if counts is None:
             known = ", ".join(DISTORTION_MODELS)

@@ -167,7 +167,7 @@ def is_better(candidate: Validation, best: Validation, settings: ValidationSetti
         settings: what its odometry may lose.
     """
     kept = candidate.tracked >= (1 - settings.frames_lost) * best.tracked
-    whole = candidate.segments <= best.segments + settings.segments_more
+    whole = candidate.segments <= max(best.segments, 1) + settings.segments_more  # none where nothing was tracked
     name = loose(settings.matches)
     remembered = all(gain(candidate, best, name, settings.matches, None, one).high >= 0 for one in best.earlier)
     return kept and whole and remembered and gain(candidate, best, name, settings.matches).low > 0

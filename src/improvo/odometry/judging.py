@@ -22,6 +22,7 @@ class SegmentJudge:
         self._settings = settings
         self._evidence = EvidenceCheck(camera, settings.verdict, settings.objective)
         self._alarms: list[str] = []
+        self._suspicions: list[str] = []
 
     def final(self, view: View, cam_from_world: Float64, xyz: Float64) -> None:
         """A view is final; keyframes are evidence.
@@ -39,10 +40,15 @@ class SegmentJudge:
         if words not in self._alarms:
             self._alarms.append(words)
 
+    def suspicion(self, words: str) -> None:
+        """Something that right segments show now and then, too; the same words count once."""
+        if words not in self._suspicions:
+            self._suspicions.append(words)
+
     def verdict(self, xyz: Float64) -> Verdict:
         """The verdict, now that the segment is over.
 
         Args:
             xyz: (P, 3) its points.
         """
-        return judge(self._evidence.finish(xyz), self._settings.verdict, tuple(self._alarms))
+        return judge(self._evidence.finish(xyz), self._settings.verdict, tuple(self._alarms), tuple(self._suspicions))

@@ -91,7 +91,7 @@ class RobustMapper(Mapper):
             return
         if self._health.ambiguous:
             self._events.two_motions(view.frame_index)
-            self._judge.alarm("two motions are in the picture, and one of them is not the camera's")
+            self._judge.suspicion("two motions are in the picture, and one of them is not the camera's")
         self._bridge(self._map, [view])
         self._confirm()
         self._slide()

@@ -47,22 +47,29 @@ class Verdict:
         }
 
 
-def judge(spread: Spread | None, settings: VerdictSettings, alarms: tuple[str, ...] = ()) -> Verdict:
+def judge(
+    spread: Spread | None,
+    settings: VerdictSettings,
+    alarms: tuple[str, ...] = (),
+    suspicions: tuple[str, ...] = (),
+) -> Verdict:
     """The verdict of a segment by the spread of its path, and by what else was seen.
 
     Args:
         spread: of the paths from the parts of the evidence; None where the segment is too short for one.
         settings: the limits.
         alarms: in plain words; each makes the segment doubtful.
+        suspicions: in plain words; where there is one, half of the largest error is enough.
     """
     if spread is None:
         return Verdict(DOUBTFUL if alarms else NOT_JUDGED, evidence=(*alarms, "too few keyframes to judge the path"))
     alarms = (*alarms, *_lens_alarms(spread, settings))
     error = estimated_error(spread, settings)
     uncertain = _uncertain(spread, settings)
-    evidence = [*alarms, _in_words(spread, error, settings)]
+    evidence = [*alarms, *suspicions, _in_words(spread, error, settings)]
     evidence += [f"frames {first} to {last}: the scale is not determined" for first, last in uncertain]
-    word = RIGHT if error <= settings.max_error and not alarms else DOUBTFUL
+    limit = 0.5 * settings.max_error if suspicions else settings.max_error
+    word = RIGHT if error <= limit and not alarms else DOUBTFUL
     return Verdict(word, error, spread.noise_px, tuple(evidence), uncertain)
 
 
