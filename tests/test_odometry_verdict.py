@@ -65,7 +65,7 @@ def test_a_half_of_the_points_that_is_bad_by_chance_does_not_count_and_noise_doe
     unlucky = replace(GOOD, error_percent=np.array([0.3] * 5 + [9.0]))
     assert estimated_error(unlucky, SETTINGS) == estimated_error(GOOD, SETTINGS)
     noisy = replace(GOOD, noise_px=3.0 * SETTINGS.usual_noise * 640)
-    assert estimated_error(noisy, SETTINGS) == pytest.approx(3.0 * estimated_error(GOOD, SETTINGS))
+    assert estimated_error(noisy, SETTINGS) == pytest.approx(27.0 * estimated_error(GOOD, SETTINGS))
     assert "pixels off" in judge(noisy, SETTINGS).evidence[0]
 
 

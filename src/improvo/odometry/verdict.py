@@ -12,6 +12,7 @@ from improvo.odometry.evidence import HALVES, PARTS, QUARTERS, Spread
 from improvo.odometry.settings import VerdictSettings
 from improvo.types import Float64
 
+_NOISE_POWER = 3  # noise of 1.4 times the usual one came with 3 to 5 times the spread (docs/robustness-odometry.md)
 _SIGMAS = 5.0  # standard errors that a deviation of the focal length must exceed
 _SIGMAS_OF_GROWTH = 8.0  # its change within a window, which a step ahead imitates; 6.7 at most in right recordings
 _LARGEST_LENS_ERROR = 0.06  # of the logarithm of a focal length; a window that knows it less well says nothing of it
@@ -102,7 +103,8 @@ def estimated_error(spread: Spread, settings: VerdictSettings) -> float:
     noise = np.nan_to_num(spread.noise_px) / (settings.usual_noise * spread.width)
     quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
     scale = settings.scale_share * float(_scale_errors(spread).max(initial=0.0))
-    return float(max(noise, 1.0) * np.sqrt((quarters**2).sum() + len(HALVES) * halves.min() ** 2 + scale**2))
+    spreads = (quarters**2).sum() + len(HALVES) * halves.min() ** 2 + scale**2
+    return float(max(noise, 1.0) ** _NOISE_POWER * np.sqrt(spreads))
 
 
 def _scale_errors(spread: Spread) -> Float64:
