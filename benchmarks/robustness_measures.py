@@ -25,7 +25,7 @@ WRONG_PERCENT = 5.0
 RIGHT_ROTATION_DEG = 2.0  # over a second
 MIN_FRAMES = 20  # of a segment, for it to count
 MIN_PATH = 0.02  # metres; without a path, an error has no share of it
-DOUBTS = ("two motions", "focal length")  # events that say that the segment may be wrong
+DOUBTS = ("focal length",)  # events that say that the segment may be wrong
 RIGHT, WRONG, NONE, IMPOSSIBLE, POSE_OF_NOTHING = "R", "w", ".", "x", "X"  # of a frame
 
 
@@ -117,11 +117,11 @@ def run_and_judge(clip: Clip, features: list[Features], frontend: Any, seed: int
     restarts = []
     interval = OdometrySettings().health.interval
     before: Trajectory | None = None
-    for number, (one, time) in enumerate(zip(features, clip.times.tolist(), strict=True)):
+    for number, (one, time, image) in enumerate(zip(features, clip.times.tolist(), clip.images, strict=True)):
         known = len(odometry.events)
         if odometry.state is TrackingState.PROVISIONAL and number % interval == 0:
             before = odometry.trajectory  # a check may start it anew
-        odometry.track_features(one, time)
+        odometry.track_features(one, time, image)
         for event in odometry.events[known:]:
             if event.kind == "contradiction" and "anew" in event.detail and before is not None:
                 running = int(before.segment.max())

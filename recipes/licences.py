@@ -8,6 +8,7 @@ Run it in an environment that has what users install and nothing else. Status 1 
 
 from __future__ import annotations
 
+import argparse
 import re
 import sys
 from importlib.metadata import Distribution, distributions
@@ -34,6 +35,7 @@ OWN_TERMS = re.compile(r"^(nvidia-|cuda-)")  # CUDA's redistributable libraries,
 
 def main() -> None:
     """Print name, version and licence of every package."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     bad = []
     for package in sorted(distributions(), key=lambda one: (one.name or "").lower()):
         name = (package.name or "?").lower()

@@ -27,7 +27,7 @@ LINK = re.compile(r"(!?)\[([^\]]*)\]\((?!https?://|#|mailto:)([^)\s]+)\)")
 
 def main() -> None:
     """Build into the folder; status 1 where two builds differ."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--url", required=True, help="of the repository, as a browser shows it")
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "dist")
     arguments = parser.parse_args()

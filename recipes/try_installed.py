@@ -33,7 +33,7 @@ assert odometry.trajectory.valid.sum() > 20
 
 def main() -> None:
     """Stops at the first command that fails."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=60)
     arguments = parser.parse_args()
     import improvo

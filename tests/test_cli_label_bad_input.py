@@ -17,7 +17,7 @@ from improvo.cli.main import main
 from improvo.labeling.labeled import read_labels
 from improvo.labeling.store import DONE, SequenceRecord, read_records
 
-OPTIONS = ["--frontend", "orb", "--max-keypoints", "200", "--set", "labels.min_observations=6"]
+OPTIONS = ["--frontend", "orb", "--max-keypoints", "300", "--set", "labels.min_observations=6"]
 FRAMES = 26
 
 

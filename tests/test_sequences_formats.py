@@ -45,7 +45,7 @@ def test_tum_associates_depth_and_truth_by_time(tmp_path: Path) -> None:
     np.testing.assert_array_equal(sequence.depth(4), depths(COUNT)[4])
     assert sequence.ground_truth is not None
     assert sequence.ground_truth.valid.tolist() == [True] * 3 + [False] * 4
-    assert any("1 of 7 images have no depth" in note for note in sequence.notes)
+    assert any("depth for 6 of 7 images" in note for note in sequence.notes)
 
 
 @pytest.mark.parametrize("swapped", [False, True])
