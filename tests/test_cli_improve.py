@@ -84,7 +84,9 @@ def test_what_shows_no_depth_is_explained(
 ) -> None:
     first = cv2.imread(str(walk / "000000.png"), cv2.IMREAD_GRAYSCALE)
     still = write_frames(tmp_path / "still", [first] * 16, walk)
-    assert "nothing could be labelled; still: " in refused(capsys, still, "-o", tmp_path / "a")
+    message = refused(capsys, still, "-o", tmp_path / "a")
+    assert "nothing could be labelled; still: " in message
+    assert "record with a camera that moves sideways" in message
     K = np.array([[260, 0, 159.5], [0, 260, 119.5], [0, 0, 1]])
     turned = []
     for angle in np.radians(0.5) * np.arange(16):

@@ -132,3 +132,19 @@ def test_a_full_disk_fails_what_does_not_fit_and_finishes_the_rest(store: Path, 
     assert "Traceback" not in run.stderr
     assert [sequence.name for sequence in read_labels(store)] == ["good"]
     assert not [path for path in store.rglob("*") if ".partial" in path.name]
+
+
+def test_labels_that_are_all_withheld_still_tell_what_was_tracked(good: Path, tmp_path: Path) -> None:
+    store = tmp_path / "labels"
+    strict = ["--set", "labels.quality.enabled=true", "--set", "labels.quality.min_median_parallax_deg=80"]
+    assert main(["label", str(good), "-o", str(store), *OPTIONS, *strict]) == 2
+    (record,) = read_records(store)
+    assert record.state != DONE
+    assert record.tracked > FRAMES // 2
+    assert record.segments >= 1
+    assert record.withheld > 5
+    assert f"{record.withheld} withheld: its frames are not to be trusted, " in record.reason
+    assert "of little parallax" in record.reason
+    assert "of a doubtful path" not in record.reason
+    assert "record with a camera that moves" in record.reason
+    assert not (store / record.name).exists()

@@ -72,7 +72,8 @@ def split_last_part(path: Path, sequence: SequenceSettings, share: float) -> Spl
     cut = len(opened) - max(round(len(opened) * share), _MIN_FRAMES)
     if cut < _MIN_FRAMES:
         raise InputError(
-            f"{path}: has {counted(len(opened), 'frame')}, too few to train on some and validate on the others"
+            f"{path}: has {counted(len(opened), 'frame')}, too few to train on some and validate on the others; "
+            "give a longer recording, some seconds at least, or several"
         )
     first_held, last = int(opened.indices[cut]), int(opened.indices[-1])
     training = replace(sequence, end=first_held, max_frames=None)

@@ -35,6 +35,13 @@ from improvo.odometry.run_settings import RunSettings
 logger = logging.getLogger(__name__)
 _POLL_SECONDS = 1.0
 _LOOK_AGAIN_SECONDS = 60.0
+_MEND = "record with a camera that moves sideways or forwards, past things with texture, for some seconds"
+_REASONS = {  # why the quality gate does not trust frames
+    "high_error": "that fit badly",
+    "little_parallax": "of little parallax",
+    "contradicted": "in doubt",
+    "doubtful": "of a doubtful path",
+}
 
 
 @dataclass(frozen=True)
@@ -153,8 +160,11 @@ def _wait_for_one(jobs: Sequence[LabelJob]) -> None:
 def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
     """Label one recording into its folder of the store, unless that is done.
 
+    Returns:
+        What was found. Where frames were tracked and no track has a label, it is a failure that says how many were.
+
     Raises:
-        InputError: no frame got a pose, or no track is long enough to have a label.
+        InputError: no frame got a pose.
         BusyError: another process does it.
         KeyboardInterrupt: it was interrupted; the partial folder is worth nothing.
     """
@@ -166,7 +176,10 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
         shutil.rmtree(job.folder, ignore_errors=True)
         try:
             record = _labeled(job, tick)
-            finish_sequence(job.store, record)
+            if record.state == DONE:
+                finish_sequence(job.store, record)
+            else:
+                shutil.rmtree(job.folder, ignore_errors=True)
         except Exception:
             shutil.rmtree(job.folder, ignore_errors=True)
             raise
@@ -184,24 +197,9 @@ def _labeled(job: LabelJob, tick: Tick) -> SequenceRecord:
     if report["interrupted"]:
         raise KeyboardInterrupt
     if labeled.tracked == 0:
-        raise InputError(f"{job.path}: no frame got a pose: {_last_reason(report)}")
+        raise InputError(f"{job.path}: no frame got a pose: {_last_reason(report)}; {_MEND}")
     counts = report["tracks"]
-    if counts["stable"] + counts["unstable"] == 0:
-        raise InputError(f"{job.path}: no track has a label ({_why_none(quality.counts(), counts)})")
-    frames = FramesTable(
-        frame=np.arange(len(trajectory)),
-        source_index=np.array(report["frames"]["source_index"], np.int64),
-        time=trajectory.times,
-        segment=trajectory.segment,
-        trusted=quality.trusted,
-    )
-    write_frames(job.folder / FRAMES_FILE, frames)
-    if job.pack:
-        try:
-            pack_images(job.folder, ((frame.image, frame.mask) for frame in sequence))
-        except OSError as error:
-            raise OutputError(f"{job.folder}: the frames cannot be packed ({error}); choose another folder") from None
-    return SequenceRecord(
+    record = SequenceRecord(
         name=job.name,
         path=str(job.path),
         state=DONE,
@@ -219,14 +217,31 @@ def _labeled(job: LabelJob, tick: Tick) -> SequenceRecord:
         packed=job.pack,
         seconds=round(time.perf_counter() - started, 3),
     )
+    if counts["stable"] + counts["unstable"] == 0:
+        why = f"{job.path}: no track has a label ({_why_none(quality.counts(), counts)}); {_MEND}"
+        return replace(record, state=FAILED, reason=why, packed=False)
+    frames = FramesTable(
+        frame=np.arange(len(trajectory)),
+        source_index=np.array(report["frames"]["source_index"], np.int64),
+        time=trajectory.times,
+        segment=trajectory.segment,
+        trusted=quality.trusted,
+    )
+    write_frames(job.folder / FRAMES_FILE, frames)
+    if job.pack:
+        try:
+            pack_images(job.folder, ((frame.image, frame.mask) for frame in sequence))
+        except OSError as error:
+            raise OutputError(f"{job.folder}: the frames cannot be packed ({error}); choose another folder") from None
+    return replace(record, seconds=round(time.perf_counter() - started, 3))
 
 
 def _stored(store: LabelStore, job: LabelJob, result: SequenceRecord | Exception) -> SequenceRecord:
     """The record of a result, which is kept if it is a failure."""
-    if isinstance(result, SequenceRecord):
+    if isinstance(result, SequenceRecord) and result.state == DONE:
         store.refresh_manifest()
         return result
-    record = _failure(job, result)
+    record = result if isinstance(result, SequenceRecord) else _failure(job, result)
     try:
         store.fail(record)
     except OutputError as error:
@@ -269,20 +284,13 @@ def _notes(report: dict[str, Any], quality: dict[str, int]) -> str:
     if len(report["segments"]) > 1:
         starts = ", ".join(str(segment["first"]) for segment in report["segments"][1:])
         notes.append(f"tracking began anew at frame {starts}")
-    reasons = {
-        "high_error": "that fit badly",
-        "little_parallax": "of little parallax",
-        "contradicted": "in doubt",
-        "doubtful": "of a doubtful path",
-    }
-    notes += [f"{quality[name]} {words}" for name, words in reasons.items() if quality[name]]
+    notes += [f"{quality[name]} {words}" for name, words in _REASONS.items() if quality[name]]
     return "; ".join(notes)
 
 
 def _why_none(quality: dict[str, int], counts: dict[str, int]) -> str:
     if counts["withheld"]:
-        return (
-            f"{counts['withheld']} withheld: of its frames {quality['little_parallax']} have too little parallax, "
-            f"{quality['high_error']} too large errors, {quality['no_pose']} no pose"
-        )
+        words = {**_REASONS, "no_pose": "without a pose"}
+        frames = ", ".join(f"{quality[name]} {text}" for name, text in words.items() if quality[name])
+        return f"{counts['withheld']} withheld: its frames are not to be trusted, {frames}"
     return "none is long enough, or all are in between stable and unstable"

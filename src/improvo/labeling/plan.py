@@ -21,6 +21,7 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.jobs.processes import Tick, run_in_processes
 from improvo.labeling.label_sequences import LabelJob, label_sequence
+from improvo.labeling.store import DONE
 from improvo.odometry.run_settings import RunSettings
 
 SAMPLES = 3  # recordings
@@ -148,6 +149,8 @@ def _sampled(job: LabelJob, tick: Tick) -> _Sample:
         tick()
 
     record = label_sequence(job, timed)
+    if record.state != DONE:
+        raise InputError(record.reason)
     ended = time.process_time()
     first = min(_START_FRAMES, len(ticks) // 2)
     frame = (ended - ticks[first - 1]) / (len(ticks) - first) if first else (ended - begun) / max(len(ticks), 1)
