@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from simulated_features import CAMERA, error_percent, hand_motion, nothing_to_see, observe, room
 
+from improvo.geometry.a_contrario import disc_probability, log10_false_alarms
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import BridgingSettings, OdometrySettings
-from improvo.odometry.significance import log10_false_alarms
 from improvo.odometry.states import TrackingState
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.types import Features
@@ -90,14 +90,19 @@ def test_a_segment_with_final_views_is_not_joined() -> None:
         result.join(0, result.placement, 0.01)
 
 
+def pose_by_chance(inliers: int, matches: int, threshold: float) -> float:
+    chance = disc_probability(CAMERA.width, CAMERA.height, threshold)
+    return log10_false_alarms(matches, inliers, chance, sample=3, models=4)
+
+
 class TestSignificance:
     def test_what_chance_gives_is_no_pose(self) -> None:
-        assert log10_false_alarms(5, 100, 3.0, CAMERA) > -1.0
-        assert log10_false_alarms(3, 3, 3.0, CAMERA) == np.inf
+        assert pose_by_chance(5, 100, 3.0) > -1.0
+        assert pose_by_chance(3, 3, 3.0) == np.inf
 
     def test_more_inliers_mean_more_and_more_matches_or_a_wider_threshold_less(self) -> None:
-        base = log10_false_alarms(15, 100, 3.0, CAMERA)
+        base = pose_by_chance(15, 100, 3.0)
         assert base < -6.0
-        assert log10_false_alarms(20, 100, 3.0, CAMERA) < base
-        assert log10_false_alarms(15, 300, 3.0, CAMERA) > base
-        assert log10_false_alarms(15, 100, 6.0, CAMERA) > base
+        assert pose_by_chance(20, 100, 3.0) < base
+        assert pose_by_chance(15, 300, 3.0) > base
+        assert pose_by_chance(15, 100, 6.0) > base

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from improvo.geometry import se3
+from improvo.geometry.a_contrario import disc_probability, log10_false_alarms
 from improvo.geometry.alignment import Similarity
 from improvo.geometry.camera import Camera
 from improvo.geometry.ransac import Ransac, absolute_pose
-from improvo.odometry.significance import log10_false_alarms
 from improvo.odometry.view import View
 from improvo.tracking.matching import match_units
 from improvo.types import Float32, Float64, Int64
@@ -92,7 +92,8 @@ class FormerMap:
         former, rows = matches.T
         found = absolute_pose(self._xyz[former], view.keypoints[rows], self._camera, self._ransac)
         inliers = int(found.inliers.sum())
-        if log10_false_alarms(inliers, len(matches), self._ransac.max_error, self._camera) > _FALSE_ALARMS:
+        chance = disc_probability(self._camera.width, self._camera.height, self._ransac.max_error)
+        if log10_false_alarms(len(matches), inliers, chance, sample=3, models=4) > _FALSE_ALARMS:  # P3P
             return None
         both = found.inliers & (view.points[rows] >= 0)
         if both.sum() < _LEAST_SHARED:
