@@ -95,13 +95,14 @@ def is_being_written(path: Path) -> bool:
             return time.time() - path.lstat().st_mtime < _FOREIGN_SECONDS
         except OSError:
             return True
-    return path.name in _open_here or _is_running(process)
+    another = process != os.getpid() and os.name == "posix"
+    return path.name in _open_here or (another and process_exists(process))
 
 
-def _is_running(process: int) -> bool:
-    """Whether another process has this number."""
-    if process == os.getpid() or os.name != "posix":
-        return False
+def process_exists(process: int) -> bool:
+    """Whether a process of this machine has this number; True where that cannot be told."""
+    if os.name != "posix":
+        return True
     try:
         os.kill(process, 0)
     except ProcessLookupError:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from improvo.errors import ImprovoError, OutputError
-from improvo.files import MARKER, make_output_folder
+from improvo.files import MARKER, make_output_folder, process_exists
 
 LOCK = ".improvo.lock"
 _BEAT_SECONDS = 5.0
@@ -268,15 +268,8 @@ def _words(holder: dict[str, Any]) -> str:
 
 
 def _is_running(process: object) -> bool:
-    if os.name != "posix" or not isinstance(process, int):
-        return True
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True
+    """Whether the holder that a file names lives; what is no number cannot be asked for."""
+    return not isinstance(process, int) or process_exists(process)
 
 
 def _busy_again(message: str, holder: str) -> BusyError:
