@@ -61,8 +61,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scale",
         nargs="+",
+        action="append",
         metavar="FROM",
-        help=f"results in metres: {USAGE} (default: up to scale)",
+        help=f"results in metres: {USAGE}; several distances by several --scale (default: up to scale)",
     )
     add_sequence_arguments(parser)
     add_config_arguments(parser)
