@@ -10,6 +10,7 @@ import numpy as np
 
 from improvo.report.charts import line_chart
 from improvo.report.page import Page, plain
+from improvo.report.plain_words import LABEL_WORDS
 
 
 @dataclass(frozen=True)
@@ -84,9 +85,12 @@ def write_improvement_page(
     for measure in measures:
         page.paragraph(f"{measure.name}: {measure.meaning}", note=True)
     for place in range(max(len(entry.pictures) for entry in rounds)):
-        for entry in (first, last) if last is not first else (first,):
-            for picture, caption in entry.pictures[place : place + 1]:
-                page.picture(picture, f"{entry.name}: {caption}")
+        shown = [
+            (picture, f"{entry.name}: {caption}")
+            for entry in ((first, last) if last is not first else (first,))
+            for picture, caption in entry.pictures[place : place + 1]
+        ]
+        page.side_by_side(shown)
     in_order = [entry for entry in rounds if not entry.aside]
     if len(in_order) > 2:
         _curves(page, measures, in_order)
@@ -95,7 +99,7 @@ def write_improvement_page(
     page.table(
         ["made with", *names],
         [[entry.name, *(f"{entry.labels.get(name, 0):,}" for name in names)] for entry in rounds if entry.labels],
-        "Tracks by label; more and longer tracks teach more.",
+        "Tracks by label; more and longer tracks teach more. " + LABEL_WORDS,
     )
     page.heading("Time")
     for entry in rounds:
