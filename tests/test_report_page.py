@@ -305,6 +305,7 @@ def test_improvement_is_told_with_its_setbacks(tmp_path: Path) -> None:
     assert "<b>0.74</b>" in text
     assert "<b>0.47</b>" in text
     assert "<b>0.58</b>" not in text
+    assert text.count("share of pairs") == 1
     assert "Worse than before: error, 0.50 → 0.58." in text
     assert "Worse than before: success" not in text
     assert text.count("<polyline") == 2

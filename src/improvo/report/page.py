@@ -17,6 +17,9 @@ from improvo.files import write_text
 _ABSOLUTE = re.compile(r"(?<![\w./:])(?:/(?:[^/\s\"'`<>|]+/)+|[A-Za-z]:\\(?:[^\\\s\"'`<>|]+\\)+)(?=[^/\s])")
 
 
+_WIDE = 2.0  # width over height of pictures that would be too small beside each other
+
+
 def plain(text: str) -> str:
     """Text as markup: escaped, and without the folders of this machine, since pages are sent to others."""
     return escape(_ABSOLUTE.sub("", text))
@@ -112,9 +115,10 @@ class Page:
         self._body.append(_figure(content, caption, narrow))
 
     def side_by_side(self, pictures: Sequence[tuple[Path, str]]) -> None:
-        """Pictures with captions in one row; below each other where the screen is narrow."""
+        """Pictures with captions in one row; below each other where the screen is narrow, or the pictures are wide."""
         figures = "".join(_figure(content, caption) for content, caption in pictures)
-        self._body.append(f'<div class="pair">{figures}</div>')
+        wide = any(_aspect(content) > _WIDE for content, _ in pictures)
+        self._body.append(f'<div class="pair{" wide" if wide else ""}">{figures}</div>')
 
     def details(self, summary: str, text: str) -> None:
         """Text that unfolds."""
@@ -151,6 +155,14 @@ def _figure(content: bytes | Path, caption: str, narrow: bytes | None = None) ->
         source = f'<source media="(max-width: 600px)" srcset="{_embedded(narrow)}">'
         image = f"<picture>{source}{image}</picture>"
     return f"<figure>{image}<figcaption>{plain(caption)}</figcaption></figure>"
+
+
+def _aspect(picture: Path) -> float:
+    """Width over height."""
+    from PIL import Image
+
+    with Image.open(picture) as image:
+        return image.width / image.height
 
 
 def _embedded(content: bytes | Path) -> str:
