@@ -15,7 +15,8 @@ from improvo.terminal import counted
 # seconds on two calm cores with `superpoint-small`; `superpoint` takes about four times as long where it trains
 _SECONDS_PER_FRAME = 0.12  # of odometry, at 640x480
 _SECONDS_PER_DEPTH = 0.35
-_SECONDS_PER_STEP = 0.35  # one core of an AMD EPYC with AVX-512 BF16, 2026-11-28; in float32 two to three times as long
+_SECONDS_PER_STEP = 0.2  # one core of an AMD EPYC with AVX-512 BF16, 2026-11-28; in float32 two to three times as long
+_MIB_PER_REMEMBERED = 2.1  # frame of 640x480, with what is held to
 _SECONDS_PER_PAIR = 0.08
 _LARGER = 4.0  # times as long for a step of the full network
 _MIB = 2**20
@@ -68,11 +69,16 @@ def estimate(
     step = _SECONDS_PER_STEP * (_LARGER if parameters > 1_000_000 else 1.0)
     each = 60 * settings.minutes if settings.minutes else steps * step
     validation = 0.12 * size * held_back * 2 + 3 * settings.validation.matches.pairs * _SECONDS_PER_PAIR
-    frames = (2 if settings.recipe == HELD else 1) * (training + held_back) + (rounds - 1) * training
+    labeled = rounds * training if settings.teaches_labels else 0
+    frames = labeled + held_back + (training + held_back if settings.recipe == HELD else 0)
     others = deep * _SECONDS_PER_DEPTH * size + trainings * each + (1 + trainings) * validation
     seconds = frames * _SECONDS_PER_FRAME * size + others
     small = min(pixels, settings.held.longer_side**2 * 3 // 4)
-    memory = _TORCH_MIB + min(training, reference.most_training) * (2.5 * small + 4 * pixels / 4) / _MIB
+    taught = min(training, reference.most_training)
+    memory = _TORCH_MIB + taught * (2.5 * small + 4 * pixels / 4) / _MIB
+    if settings.held.pairs.whole_frames:
+        remembered = min(taught, settings.held.pairs.frames_remembered)
+        memory += remembered * _MIB_PER_REMEMBERED * small / (640 * 480)
     disk = 60 + 0.1 * (training + held_back) * (1 + trainings) + deep * pixels / 4 * 1.3 / _MIB + 12 * trainings
     return Estimate(seconds / 60, memory, disk, steps, frames, others / 60)
 
