@@ -216,7 +216,7 @@ def _scale_lines(report: dict[str, Any]) -> list[str]:
 
 def _print_summary(summary: LabeledRun) -> None:
     from improvo.odometry.run_folder import why_no_pose
-    from improvo.odometry.told_verdicts import verdict_lines
+    from improvo.odometry.verdict.told_verdicts import verdict_lines
 
     report = summary.report
     frames, segments = report["frames"], report["segments"]

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from improvo.odometry.told_verdicts import verdict_lines
-from improvo.odometry.verdict import DOUBTFUL
+from improvo.odometry.verdict.told_verdicts import verdict_lines
+from improvo.odometry.verdict.verdict import DOUBTFUL
 from improvo.types import Float64, Int64
 
 LABEL_WORDS = (

@@ -11,8 +11,8 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.odometry.run_folder import RunFolder
-from improvo.odometry.told_verdicts import verdict_lines, verdict_of
-from improvo.odometry.verdict import DOUBTFUL
+from improvo.odometry.verdict.told_verdicts import verdict_lines, verdict_of
+from improvo.odometry.verdict.verdict import DOUBTFUL
 from improvo.report.charts import line_chart
 from improvo.report.map_picture import map_png, trusted_points
 from improvo.report.page import Page, plain
