@@ -22,6 +22,7 @@ from improvo.labeling.labeler import run_and_label
 from improvo.labeling.store import (
     DONE,
     FAILED,
+    RECORD_FILE,
     LabelStore,
     SequenceRecord,
     finish_sequence,
@@ -29,7 +30,7 @@ from improvo.labeling.store import (
     lock_of,
     sequence_names,
 )
-from improvo.locations import folder_here, refresh, url_of
+from improvo.locations import folder_here, looked_up, refresh, url_of
 from improvo.odometry.run_settings import RunSettings
 
 logger = logging.getLogger(__name__)
@@ -104,7 +105,7 @@ def label_sequences(
         OutputError, ConfigError: the store cannot be used, see `LabelStore`.
     """
     names = sequence_names(list(paths))
-    store = LabelStore(folder, _fingerprint(settings, pack), relabel, type(settings))
+    store = LabelStore(folder, fingerprint(settings, pack), relabel, type(settings))
     before = {record.name: record for record in store.records() if record.state == DONE}
     records = {name: before[name] for name in names if name in before}
     for name, record in records.items():
@@ -170,6 +171,7 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
     """
     job = replace(job, store=folder_here(job.store, job.url))
     with claimed(job.lock, job.path):
+        looked_up(job.store / job.name / RECORD_FILE)  # another machine may have done it
         done = finished_record(job.store, job.name)
         if done is not None:
             return done
@@ -257,7 +259,7 @@ def _failure(job: LabelJob, error: Exception) -> SequenceRecord:
     return replace(SequenceRecord(job.name, str(job.path), FAILED), reason=str(error))
 
 
-def _fingerprint(settings: RunSettings, pack: bool) -> dict[str, Any]:
+def fingerprint(settings: RunSettings, pack: bool) -> dict[str, Any]:
     """Everything that the labels depend on; a weights file by its content."""
     import hashlib
 

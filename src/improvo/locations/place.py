@@ -19,6 +19,7 @@ Answer = TypeVar("Answer")
 STATE = "place.json"  # beside the folder: what of it is at the location
 RECORD = "label.json"  # of a sequence of labels; it is sent last
 _KEPT_HIDDEN = re.compile(r"\.improvo\.json|\..+\.failed\.json")  # hidden files that belong to a folder's content
+_LOCK = re.compile(r"\.[^/]+\.lock")
 _WAITS = (0.5, 2.0, 8.0)  # seconds between tries
 
 
@@ -28,6 +29,7 @@ class Place:
     def __init__(self, url: str, folder: Path, writing: bool) -> None:
         self.url, self.folder, self.writing = url, folder, writing
         self.listing: dict[str, int] = {}  # bytes of every file at the location, by its name in the folder
+        self.locks: list[str] = []  # names of lock files at the location
         self._sent: dict[str, list[int]] = {}  # bytes and time of every local file that is the one at the location
         self._process = -1
         self._state = folder.parent / STATE
@@ -80,6 +82,23 @@ class Place:
         _ = self.fs
         name = self.name(path)
         return str(self._root if name == "." else f"{self._root.rstrip('/')}/{name}")
+
+    def look(self, path: Path) -> None:
+        """Know whether a file is there now."""
+        target = self.remote(path)
+
+        def ask() -> int | None:
+            self.fs.invalidate_cache()
+            try:
+                return int(self.fs.info(target).get("size") or 0)
+            except FileNotFoundError:
+                return None
+
+        size = self.tries(ask, "read", InputError)
+        if size is None:
+            self.listing.pop(self.name(path), None)
+        else:
+            self.listing[self.name(path)] = size
 
     def fetch(self, path: Path) -> None:
         """Bring a file here, if it is there; it appears as a whole."""
@@ -162,7 +181,7 @@ class Place:
                 break
             time.sleep(wait)
         reason = " ".join(str(fault).split())[:120] or type(fault).__name__
-        end = f"what is done is kept in {self.folder}; run again to go on" if what == "written" else "try again"
+        end = f"what is done is kept in {self.folder.parent}; run again to go on" if what == "written" else "try again"
         raise kind(f"{self.url}: cannot be {what} ({reason}); {end}") from None
 
     def _find(self) -> dict[str, int]:
@@ -174,11 +193,9 @@ class Place:
             found = fs.find(root, detail=True)
         except FileNotFoundError:
             return {}
-        return {
-            name: int(entry.get("size") or 0)
-            for full, entry in found.items()
-            if (name := full.removeprefix(root).lstrip("/")) and belongs(name)
-        }
+        sizes = {full.removeprefix(root).lstrip("/"): int(entry.get("size") or 0) for full, entry in found.items()}
+        self.locks = [name for name in sizes if _LOCK.fullmatch(name)]
+        return {name: size for name, size in sizes.items() if name and belongs(name)}
 
     def _is_sent(self, path: Path) -> bool:
         try:
