@@ -147,6 +147,56 @@ def test_a_full_bucket_is_one_line_and_a_second_start_goes_on(memory: str) -> No
     assert names(memory) == {"a.txt"}
 
 
+def test_labelling_ends_where_the_store_vanishes_and_goes_on_later(
+    memory: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    walks = [str(write_walk(tmp_path / name, frames=16, seed=0)) for name in ("attic", "hall", "kitchen")]
+    words = ["label", *walks, "-o", memory, *ORB]
+    tries: list[str] = []
+    file_system = locations.Place.fs.fget
+    assert file_system is not None
+
+    def gone(self: locations.Place) -> Any:
+        real = file_system(self)
+        if not any(name.endswith("attic/label.json") for name in real.find("bucket")):
+            return real
+        return Failing(real, "info", 1000, TimeoutError("no answer"))
+
+    with monkeypatch.context() as away:
+        away.setattr(locations.Place, "fs", property(gone))
+        away.setattr(time, "sleep", lambda seconds: tries.append("again"))
+        assert main(words) == 2
+    said = capsys.readouterr()
+    assert said.out.count("frames with a pose") == 1
+    assert f"{memory}: cannot be read (no answer); try again" in said.err
+    assert len(tries) == 2
+    assert main(words) == 0
+    assert "3 of 3 sequences labelled" in capsys.readouterr().out
+
+
+def test_where_it_does_not_answer_one_try_is_enough_to_see_whether_it_is_back(memory: str) -> None:
+    folder = local_folder(memory)
+    opened = locations._places[folder]
+    opened._fs = Failing(opened.fs, "put_file", 4, TimeoutError("slow"))
+    for left in (1, 0):
+        with pytest.raises(OutputError, match="cannot be written"):
+            write_text(folder / "a.txt", "one")
+        assert opened._fs.left == left
+    write_text(folder / "b.txt", "two")
+    publish(folder)
+    assert names(memory) == {"a.txt", "b.txt"}
+
+
+def test_a_location_that_lost_all_of_it_is_begun_anew(memory: str, tmp_path: Path) -> None:
+    words = ["label", str(write_walk(tmp_path / "attic", frames=16, seed=0)), "-o", memory, *ORB]
+    assert main(words) == 0
+    there = names(memory)
+    fsspec.filesystem("memory").store.clear()
+    locations._places.clear()
+    assert main(words) == 0
+    assert names(memory) == there
+
+
 def test_a_store_that_vanishes_is_one_line(memory: str, tmp_path: Path) -> None:
     upload(write_labeled_scene(tmp_path / "labels"), memory)
     folder = local_folder(memory, writing=False)
@@ -205,7 +255,7 @@ def check_lock(url: str, tmp_path: Path) -> None:
     assert names(url) == set()
     died = claim.Claim(there, there.folder / ".improvo.lock", mine, lambda holder: False)
     died._released.set()  # without a beat
-    time.sleep(0.3)
+    time.sleep(0.5)
     with locked(here):
         found = claim.read_claim(there, there.folder / ".improvo.lock")
         assert found is not None

@@ -30,7 +30,7 @@ from improvo.labeling.store import (
     lock_of,
     sequence_names,
 )
-from improvo.locations import folder_here, looked_up, refresh, url_of
+from improvo.locations import LOCATION_ERRORS, folder_here, lock_files, looked_up, refresh, url_of
 from improvo.odometry.run_settings import RunSettings
 
 logger = logging.getLogger(__name__)
@@ -102,7 +102,7 @@ def label_sequences(
     Raises:
         InputError: none of them could be labelled, or there is no Ray cluster.
         MissingExtraError: Ray is not installed.
-        OutputError, ConfigError: the store cannot be used, see `LabelStore`.
+        OutputError, ConfigError: the store cannot be used, see `LabelStore`, or its location does not answer any more.
     """
     names = sequence_names(list(paths))
     store = LabelStore(folder, fingerprint(settings, pack), relabel, type(settings))
@@ -126,15 +126,18 @@ def label_sequences(
                 elsewhere.append(job)
                 on_wait(job.name, result.holder)
                 return
+            if isinstance(result, LOCATION_ERRORS):  # of no use to label on
+                raise result
             records[job.name] = _stored(store, job, result)
             on_record(records[job.name])
 
         crew.do(label_sequence, jobs, on_result, on_frames, gpus)
         return elsewhere
 
+    taken = set(lock_files(store.folder))  # by other machines; the others first
+    jobs.sort(key=lambda job: job.lock in taken)
     crew = Crew(workers, ray)
     gpus = int(ray is not None and settings.frontend.network.device == "cuda")
-
     while jobs:
         jobs = run(jobs)
         _wait_for_one(jobs)

@@ -18,10 +18,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from improvo.errors import InputError, OutputError
+from improvo.errors import OutputError
 from improvo.locations.claim import Claim, IsDead, read_claim
-from improvo.locations.place import RECORD, STATE, Place, belongs
+from improvo.locations.place import RECORD, STATE, LocationReadError, LocationWriteError, Place, belongs
 
+LOCATION_ERRORS = (LocationReadError, LocationWriteError)
 _SCHEME = re.compile(r"([a-z][a-z0-9+.-]*)://(.+)", re.DOTALL)
 _FILES = "files"  # in a folder for each location
 _places: dict[Path, Place] = {}
@@ -100,7 +101,7 @@ def take_claim(path: Path, mine: dict[str, Any], is_dead: IsDead) -> Claim | Non
         path, mine, is_dead: see `Claim`.
 
     Raises:
-        ClaimedError, OutputError: see `Claim`.
+        ClaimedError, LocationReadError, LocationWriteError: see `Claim`.
     """
     place = _place_of(path)
     return Claim(place, path, mine, is_dead) if place is not None and place.writing else None
@@ -110,7 +111,7 @@ def claimant(path: Path) -> dict[str, Any] | None:
     """Who holds a lock file at a location; None if nobody does, and for a path of this machine.
 
     Raises:
-        OutputError: the location cannot be read.
+        LocationReadError: the location does not answer.
     """
     place = _place_of(path)
     return read_claim(place, path) if place is not None and place.writing else None
@@ -164,7 +165,7 @@ def opened(path: Path) -> Any:
     if place is None or place.name(path) not in place.listing:
         return path
     target = place.remote(path)
-    return place.tries(lambda: place.fs.open(target, "rb", block_size=1 << 20), "read", InputError)
+    return place.tries(lambda: place.fs.open(target, "rb", block_size=1 << 20), "read", LocationReadError)
 
 
 def exists(path: Path) -> bool:
@@ -224,6 +225,8 @@ def close(success: bool = True) -> None:
     try:
         for place in list(_places.values()):
             if place.writing:
+                if not success:
+                    place.give_up()
                 place.send_all(place.folder)
     except OutputError:
         if success:

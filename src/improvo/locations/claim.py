@@ -15,8 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from improvo.errors import OutputError
-from improvo.locations.place import Place
+from improvo.locations.place import LocationReadError, LocationWriteError, Place
 
 BEAT_SECONDS = 15.0  # a request for each sequence in work
 _PATIENCE_BEATS = 5.0  # without a beat, after which the holder is dead
@@ -48,15 +47,15 @@ class Claim:
 
     Raises:
         ClaimedError: somebody else has it.
-        OutputError: the location cannot be written to.
+        LocationReadError, LocationWriteError: the location does not answer.
     """
 
     def __init__(self, place: Place, path: Path, mine: dict[str, Any], is_dead: IsDead) -> None:
         self._place, self._path, self._target = place, path, place.remote(path)
-        self._mine, self._beats = mine, 0
+        self._mine = mine
         if not self._created():
             holder = read_claim(place, path)
-            if holder is not None and not is_dead(holder) and self._is_renewed(holder):
+            if holder is not None and not is_dead(holder) and (_is_fresh(holder) or self._is_renewed(holder)):
                 raise ClaimedError(holder)
             self._take()
             time.sleep(_SETTLE_SECONDS)
@@ -74,7 +73,7 @@ class Claim:
                 self._place.fs.rm_file(self._target)
 
     def _content(self) -> bytes:
-        return json.dumps({**self._mine, "beat": self._beats}).encode()
+        return json.dumps({**self._mine, "beat": time.time()}).encode()
 
     def _created(self) -> bool:
         """Whether nobody had it, and this process has it now."""
@@ -91,32 +90,40 @@ class Claim:
                 return False
             return True
 
-        return self._place.tries(create, "written", OutputError)
+        return self._place.tries(create, "written", LocationWriteError)
 
     def _take(self) -> None:
-        self._place.tries(lambda: self._place.fs.pipe_file(self._target, self._content()), "written", OutputError)
+        self._place.tries(self._write, "written", LocationWriteError)
+
+    def _write(self) -> None:
+        self._place.fs.pipe_file(self._target, self._content())
 
     def _is_renewed(self, holder: dict[str, Any]) -> bool:
-        """Whether the holder writes the file anew, or lets go, while it is watched."""
+        """Whether the holder writes the file anew while it is watched; the clocks of two machines may differ."""
         ends = time.monotonic() + _PATIENCE_BEATS * BEAT_SECONDS
         while time.monotonic() < ends:
             time.sleep(_LOOK_SECONDS)
-            if read_claim(self._place, self._path) != holder:
-                return True
+            if (now := read_claim(self._place, self._path)) != holder:
+                return now is not None
         return False
 
     def _beat(self) -> None:
         while not self._released.wait(BEAT_SECONDS):
-            self._beats += 1
             with suppress(Exception):  # a location that is away for a while
-                self._place.fs.pipe_file(self._target, self._content())
+                self._write()
+
+
+def _is_fresh(holder: dict[str, Any]) -> bool:
+    """Whether the last beat was just now, by the clock of this machine."""
+    beat = holder.get("beat")
+    return isinstance(beat, int | float) and abs(time.time() - beat) < 2 * BEAT_SECONDS
 
 
 def read_claim(place: Place, path: Path) -> dict[str, Any] | None:
     """Who holds it; None if nobody does.
 
     Raises:
-        OutputError: the location cannot be read.
+        LocationReadError: the location does not answer.
     """
     target = place.remote(path)
 
@@ -128,7 +135,7 @@ def read_claim(place: Place, path: Path) -> dict[str, Any] | None:
             return None
         return content
 
-    content = place.tries(read, "read", OutputError)
+    content = place.tries(read, "read", LocationReadError)
     if content is None:
         return None
     try:
