@@ -9,7 +9,7 @@ from pathlib import Path
 
 from improvo.errors import OutputError
 from improvo.improvement.recipe import steps_of
-from improvo.improvement.settings import HELD, ImproveSettings
+from improvo.improvement.settings import METRIC, TRACKS, ImproveSettings
 from improvo.terminal import counted
 
 # seconds on two calm cores with `superpoint-small`; `superpoint` takes about four times as long where it trains
@@ -17,6 +17,7 @@ _SECONDS_PER_FRAME = 0.12  # of odometry, at 640x480
 _SECONDS_PER_DEPTH = 0.35
 _SECONDS_PER_STEP = 0.35  # one core of an AMD EPYC with AVX-512 BF16, 2026-11-28; in float32 two to three times as long
 _SECONDS_PER_PAIR = 0.08
+_SECONDS_PER_FRAME_PAIR = 0.02  # of the recipe `metric`, beside the features of its frames
 _LARGER = 4.0  # times as long for a step of the full network
 _MIB = 2**20
 _TORCH_MIB = 900  # of a process that trains
@@ -67,8 +68,10 @@ def estimate(
     trainings = rounds + settings.control
     step = _SECONDS_PER_STEP * (_LARGER if parameters > 1_000_000 else 1.0)
     each = 60 * settings.minutes if settings.minutes else steps * step
+    if settings.recipe == METRIC:
+        each = training * _SECONDS_PER_FRAME * size + steps * _SECONDS_PER_FRAME_PAIR
     validation = 0.12 * size * held_back * 2 + 3 * settings.validation.matches.pairs * _SECONDS_PER_PAIR
-    frames = (2 if settings.recipe == HELD else 1) * (training + held_back) + (rounds - 1) * training
+    frames = (1 if settings.recipe == TRACKS else 2) * (training + held_back) + (rounds - 1) * training
     others = deep * _SECONDS_PER_DEPTH * size + trainings * each + (1 + trainings) * validation
     seconds = frames * _SECONDS_PER_FRAME * size + others
     small = min(pixels, settings.held.longer_side**2 * 3 // 4)
