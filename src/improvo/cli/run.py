@@ -18,6 +18,7 @@ from improvo.cli.options import (
     add_sequence_arguments,
     folder_path,
     recording_path,
+    recording_words,
     settings_from,
 )
 from improvo.cli.output import figures, next_step, notice, say
@@ -122,7 +123,7 @@ def _tracked(arguments: argparse.Namespace, sequence: Sequence, settings: DenseR
             f"`improvo report {summary.folder}` makes a page of it, `improvo show map {summary.folder}` a picture"
         )
     else:
-        next_step(f"`improvo info {arguments.sequence}` looks for what is wrong with the recording")
+        next_step(f"`improvo info {recording_words(arguments.sequence)}` looks for what is wrong with the recording")
     if interrupted:
         return 130
     return 0 if summary.tracked else NO_RESULT
