@@ -9,7 +9,7 @@ from pathlib import Path
 
 from improvo.errors import OutputError
 from improvo.improvement.recipe import steps_of
-from improvo.improvement.settings import HELD, ImproveSettings
+from improvo.improvement.settings import METRIC, TRACKS, ImproveSettings
 from improvo.terminal import counted
 
 # seconds on two calm cores with `superpoint-small`; `superpoint` takes about four times as long where it trains
@@ -18,6 +18,7 @@ _SECONDS_PER_DEPTH = 0.35
 _SECONDS_PER_STEP = 0.35  # one core of an AMD EPYC with AVX-512 BF16, 2026-11-28; in float32 two to three times as long
 _SECONDS_PER_PAIR = 0.08
 _GAPS = 3  # between the frames of a pair
+_SECONDS_PER_FRAME_PAIR = 0.02  # of the recipe `metric`, beside the features of its frames
 _LARGER = 4.0  # times as long for a step of the full network
 _MIB = 2**20
 _TORCH_MIB = 900  # of a process that trains
@@ -91,8 +92,10 @@ def estimate(
     steps = steps_of(settings, training)
     trainings = rounds + settings.control
     each = costs.start + (60 * settings.minutes if settings.minutes else steps * costs.step)
+    if settings.recipe == METRIC:
+        each = training * costs.frame + steps * _SECONDS_PER_FRAME_PAIR
     # of a whole recording the reference has the labels of the start already
-    whole = (1 if recordings else 2) if settings.recipe == HELD else 1
+    whole = 1 if settings.recipe == TRACKS or recordings else 2
     frames = whole * (training + held_back) + (rounds - 1) * training + trainings * held_back
     pairs = max(recordings, 1) * min(settings.validation.matches.pairs, held_back // max(recordings, 1))
     validations = (1 + trainings) * pairs * _GAPS * costs.pair
