@@ -35,6 +35,24 @@ class MissingExtraError(ImprovoError):
         super().__init__(f"{feature} needs an optional dependency: pip install 'improvo[{extra}]'")
 
 
+PLOTS_MISSING = "pip install 'improvo[plots]'"
+
+
+def plots_installed() -> bool:
+    """Whether curves and maps can be drawn."""
+    return installed("matplotlib")
+
+
+def require_plots(feature: str) -> None:
+    """Refuse what is drawn with matplotlib before any work is done.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    if not plots_installed():
+        raise MissingExtraError(feature, "plots")
+
+
 def installed(package: str) -> bool:
     """Whether a package can be imported; nothing is loaded."""
     try:
