@@ -15,7 +15,7 @@ from improvo.odometry.events import Event
 from improvo.odometry.segments import Segment
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import TrackingState
-from improvo.odometry.verdict import RIGHT as RIGHT_WORD
+from improvo.odometry.verdict.verdict import RIGHT as RIGHT_WORD
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.types import Features, Float64, Trajectory
 from robustness_clips import Clip

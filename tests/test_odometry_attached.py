@@ -6,10 +6,10 @@ import numpy as np
 from simulated_features import CAMERA, World, error_percent, hand_motion, observe, room
 
 from improvo.geometry import se3
-from improvo.odometry.attached import AttachedDetector
-from improvo.odometry.local_map import LocalMap
+from improvo.odometry.alarms.attached import AttachedDetector
+from improvo.odometry.mapping.local_map import LocalMap
+from improvo.odometry.mapping.start import start_map
 from improvo.odometry.settings import AttachedSettings, OdometrySettings
-from improvo.odometry.start import start_map
 from improvo.odometry.view import View
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.tracking.connect import TrackChain

@@ -7,9 +7,9 @@ from simulated_features import CAMERA, hand_motion, room
 
 from improvo.backend.settings import ObjectiveSettings
 from improvo.geometry import se3
-from improvo.odometry.evidence import PARTS, EvidenceCheck, Spread, error_percent
 from improvo.odometry.settings import VerdictSettings
-from improvo.odometry.verdict import DOUBTFUL, RIGHT, judge
+from improvo.odometry.verdict.evidence import PARTS, EvidenceCheck, Spread, error_percent
+from improvo.odometry.verdict.verdict import DOUBTFUL, RIGHT, judge
 from improvo.odometry.view import View
 from improvo.types import Float64
 

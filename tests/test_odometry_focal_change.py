@@ -9,7 +9,7 @@ import pytest
 from simulated_features import CAMERA, hand_motion, observe, room
 
 from improvo.geometry import se3
-from improvo.odometry.focal_change import focal_change
+from improvo.odometry.alarms.focal_change import focal_change
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
 from improvo.odometry.visual_odometry import VisualOdometry

@@ -6,7 +6,7 @@ import numpy as np
 from simulated_features import CAMERA, hand_motion, observe, room
 
 from improvo.geometry import se3
-from improvo.odometry.health import HealthCheck
+from improvo.odometry.alarms.health import HealthCheck
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
 from improvo.tracking.matching import unit_descriptors

@@ -9,9 +9,9 @@ import pytest
 from simulated_features import CAMERA, hand_motion, nothing_to_see, observe, room, views_of
 
 from improvo.geometry import se3
-from improvo.odometry.local_map import LocalMap
+from improvo.odometry.mapping.local_map import LocalMap
+from improvo.odometry.mapping.start import start_map
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.start import start_map
 from improvo.odometry.view import View
 
 FRAMES = 26

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from improvo.geometry import se3
-from improvo.odometry.patch_alignment import (
+from improvo.odometry.refinement.patch_alignment import (
     REACH,
     Aligned,
     align,

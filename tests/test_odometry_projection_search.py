@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from improvo.odometry.projection_search import match_by_projection
+from improvo.odometry.mapping.projection_search import match_by_projection
 from improvo.types import Float32, Float64
 
 

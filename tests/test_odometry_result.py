@@ -10,11 +10,11 @@ from improvo.geometry import se3
 from improvo.geometry.alignment import Similarity
 from improvo.odometry.events import EventLog
 from improvo.odometry.map_builder import MapBuilder
+from improvo.odometry.mapping.window import WindowReport
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.segments import SegmentPlacement
 from improvo.odometry.trajectory_builder import FinalView, TrajectoryBuilder
 from improvo.odometry.view import View
-from improvo.odometry.window import WindowReport
 from improvo.types import Float64
 
 POINTS = np.array([[0.0, 0.0, 2.0], [0.2, 0.1, 2.0], [-0.3, 0.2, 4.0]])

@@ -10,7 +10,7 @@ import pytest
 from simulated_features import CAMERA, error_percent, hand_motion, nothing_to_see, observe, room
 
 from improvo.odometry import robust
-from improvo.odometry.initial_pair import InitFailure
+from improvo.odometry.mapping.initial_pair import InitFailure
 from improvo.odometry.settings import BridgingSettings, OdometrySettings
 from improvo.odometry.states import TrackingState
 from improvo.odometry.trajectory_builder import FinalView

@@ -9,10 +9,10 @@ import pytest
 from simulated_features import CAMERA, World, error_percent, hand_motion, nothing_to_see, observe, room, views_of, wall
 
 from improvo.geometry import se3
-from improvo.odometry.initial_pair import InitFailure, InitialPair, initial_pair
-from improvo.odometry.local_map import LocalMap
+from improvo.odometry.mapping.initial_pair import InitFailure, InitialPair, initial_pair
+from improvo.odometry.mapping.local_map import LocalMap
+from improvo.odometry.mapping.start import start_map
 from improvo.odometry.settings import OdometrySettings, StartSettings, WindowSettings
-from improvo.odometry.start import start_map
 from improvo.odometry.view import View
 from improvo.types import Float64
 
@@ -144,7 +144,7 @@ def test_dark_frames_in_the_buffer_stay_without_a_pose() -> None:
 
 
 def test_the_start_adjusts_no_more_views_than_the_window_has(monkeypatch: pytest.MonkeyPatch) -> None:
-    from improvo.odometry import start
+    from improvo.odometry.mapping import start
 
     sizes: list[tuple[int, int]] = []
     adjust = start.adjust

@@ -12,12 +12,12 @@ from simulated_features import CAMERA, hand_motion, room
 from improvo.backend.settings import ObjectiveSettings
 from improvo.errors import ConfigError
 from improvo.geometry import se3
-from improvo.odometry.evidence import PARTS, Spread
-from improvo.odometry.evidence_window import EvidenceKeyframe, EvidenceWindow
-from improvo.odometry.lens_evidence import LensMeasure, measured_lens
 from improvo.odometry.settings import VerdictSettings
-from improvo.odometry.told_verdicts import doubtful_frames, uncertain_frames, verdict_lines
-from improvo.odometry.verdict import DOUBTFUL, NOT_JUDGED, RIGHT, Verdict, estimated_error, joined, judge
+from improvo.odometry.verdict.evidence import PARTS, Spread
+from improvo.odometry.verdict.evidence_window import EvidenceKeyframe, EvidenceWindow
+from improvo.odometry.verdict.lens_evidence import LensMeasure, measured_lens
+from improvo.odometry.verdict.told_verdicts import doubtful_frames, uncertain_frames, verdict_lines
+from improvo.odometry.verdict.verdict import DOUBTFUL, NOT_JUDGED, RIGHT, Verdict, estimated_error, joined, judge
 from improvo.types import Float64
 
 SETTINGS = VerdictSettings()

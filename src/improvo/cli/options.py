@@ -88,6 +88,13 @@ def recording_path(text: str) -> Path:
     return bundled_sequence()
 
 
+def recording_words(path: Path) -> str:
+    """A recording as the user would write it: the bundled one is `demo`, wherever it lies."""
+    from improvo.simulation import bundled_sequence
+
+    return "demo" if path == bundled_sequence() else str(path)
+
+
 def folder_path(text: str) -> Path:
     """The type of an argument that names a folder to write in, here or at a location such as `s3://bucket/folder`."""
     from improvo.locations import local_folder

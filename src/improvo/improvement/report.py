@@ -163,7 +163,7 @@ def _gains(judged: Sequence[tuple[Candidate, Validation]], settings: ValidationS
         names, limits = (loose(settings.matches), strict(settings.matches)), settings.matches.right_px[::-1]
         for name, limit in zip(names, limits, strict=True):
             gains = (gain(validation, start, name, settings.matches, level) for level in (None, *start.levels))
-            rows.append([f"{candidate.name}, {limit:g} px", *(found.words for found in gains)])
+            rows.append([f"{candidate.name}, {limit:g} px", *(found.cell for found in gains)])
     return rows
 
 

@@ -101,11 +101,21 @@ class Gain:
     @property
     def words(self) -> str:
         """In per cent of what it was before, with the interval."""
+        value, interval = self._parts
+        return f"{value}, 95 % interval {interval}"
+
+    @property
+    def cell(self) -> str:
+        """The same for a table that says what stands in brackets."""
+        value, interval = self._parts
+        return f"{value} ({interval.removesuffix(' %')})"
+
+    @property
+    def _parts(self) -> tuple[str, str]:
         if self.before <= 0:
-            return f"{self.difference:+.3f}, 95 % interval {self.low:+.3f} to {self.high:+.3f}"
+            return f"{self.difference:+.3f}", f"{self.low:+.3f} to {self.high:+.3f}"
         share = 100 / self.before
-        low, high = self.low * share, self.high * share
-        return f"{self.difference * share:+.1f} %, 95 % interval {low:+.1f} to {high:+.1f} %"
+        return f"{self.difference * share:+.1f} %", f"{self.low * share:+.1f} to {self.high * share:+.1f} %"
 
 
 def loose(settings: SelfTruthSettings) -> str:

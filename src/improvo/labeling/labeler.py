@@ -25,7 +25,7 @@ from improvo.labeling.quality import (
     withhold_labels,
 )
 from improvo.odometry.run import RunSummary, run_odometry
-from improvo.odometry.told_verdicts import doubtful_frames
+from improvo.odometry.verdict.told_verdicts import doubtful_frames
 from improvo.stability.settings import LabelSettings
 from improvo.stability.tables import (
     POINTS_FILE,

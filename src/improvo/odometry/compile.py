@@ -9,7 +9,8 @@ import numpy as np
 from improvo.backend.compile import compile_kernels, kernels_are_cached
 from improvo.compiled import all_cached
 from improvo.frontend import corners
-from improvo.odometry import patch_alignment, projection_search
+from improvo.odometry.mapping import projection_search
+from improvo.odometry.refinement import patch_alignment
 from improvo.tracking import matching
 
 _OTHER_KERNELS = (

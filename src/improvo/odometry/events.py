@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from improvo.odometry.bridging import Join
+from improvo.odometry.mapping.bridging import Join
 from improvo.odometry.segments import Segment
-from improvo.odometry.verdict import DOUBTFUL
+from improvo.odometry.verdict.verdict import DOUBTFUL
 
 _WORTH_SAYING = 0.03  # share of the keypoints
 _SAID_AGAIN = 20  # frames

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 
 from improvo.geometry.camera import Camera
 from improvo.odometry.events import EventLog
-from improvo.odometry.local_map import LocalMap
+from improvo.odometry.mapping.local_map import LocalMap
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import TrackingState

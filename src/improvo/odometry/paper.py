@@ -11,15 +11,15 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
+from improvo.odometry.alarms.health import HealthCheck
 from improvo.odometry.events import EventLog
-from improvo.odometry.health import HealthCheck
-from improvo.odometry.local_map import LocalMap
 from improvo.odometry.mapper import Mapper
+from improvo.odometry.mapping.local_map import LocalMap
+from improvo.odometry.mapping.window import adjust
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import TrackingState
 from improvo.odometry.view import NO_POINT, View, inherit_points
-from improvo.odometry.window import adjust
 from improvo.types import Float64
 
 

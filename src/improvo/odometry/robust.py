@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from improvo.geometry.camera import Camera
-from improvo.odometry.attached import AttachedDetector
-from improvo.odometry.bridging import Bridging
+from improvo.odometry.alarms.attached import AttachedDetector
+from improvo.odometry.alarms.focal_change import focal_change
+from improvo.odometry.alarms.health import HealthCheck
 from improvo.odometry.events import EventLog
-from improvo.odometry.focal_change import focal_change
-from improvo.odometry.former_map import FormerMap
-from improvo.odometry.health import HealthCheck
-from improvo.odometry.initial_pair import InitFailure
-from improvo.odometry.judging import SegmentJudge
-from improvo.odometry.local_map import LocalMap
 from improvo.odometry.mapper import Mapper
+from improvo.odometry.mapping.bridging import Bridging
+from improvo.odometry.mapping.former_map import FormerMap
+from improvo.odometry.mapping.initial_pair import InitFailure
+from improvo.odometry.mapping.local_map import LocalMap
+from improvo.odometry.mapping.sliding_window import SlidingWindow
+from improvo.odometry.mapping.start import start_map
+from improvo.odometry.mapping.window import WindowReport, adjust
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.sliding_window import SlidingWindow
-from improvo.odometry.start import start_map
 from improvo.odometry.states import StateMachine, TrackingState
+from improvo.odometry.verdict.judging import SegmentJudge
 from improvo.odometry.view import NO_POINT, View
-from improvo.odometry.window import WindowReport, adjust
 from improvo.types import Float64
 
 _CARRIED = 0.2  # share of the observations that turned out to move with the camera; with more the map is wrong

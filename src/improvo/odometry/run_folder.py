@@ -19,7 +19,7 @@ from improvo.geometry.camera import Camera
 from improvo.geometry.trajectory_files import read_trajectory
 from improvo.odometry.map_file import read_map
 from improvo.odometry.run import unit_of
-from improvo.odometry.told_verdicts import doubtful_frames, uncertain_frames
+from improvo.odometry.verdict.told_verdicts import doubtful_frames, uncertain_frames
 from improvo.odometry.view import Mask
 from improvo.sequences import Sequence, SequenceSettings, open_sequence
 from improvo.stability.rule import IGNORE

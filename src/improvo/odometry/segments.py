@@ -8,7 +8,7 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.alignment import Similarity
-from improvo.odometry.verdict import NOT_JUDGED, Verdict, joined
+from improvo.odometry.verdict.verdict import NOT_JUDGED, Verdict, joined
 from improvo.types import Float64
 
 

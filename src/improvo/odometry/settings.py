@@ -80,7 +80,7 @@ class TrackingLossSettings:
 
 @dataclass(frozen=True)
 class HealthSettings:
-    """The independent check of the map against two views (see `improvo.odometry.health`)."""
+    """The independent check of the map against two views (see `improvo.odometry.alarms.health`)."""
 
     interval: int = 5  # frames between two checks
     gaps: tuple[int, ...] = (3, 6, 12)  # frames between the two views of a check
@@ -95,7 +95,7 @@ class HealthSettings:
 
 @dataclass(frozen=True)
 class VerdictSettings:
-    """When a segment's path is believed (see `improvo.odometry.evidence` and `improvo.odometry.verdict`)."""
+    """When a segment's path is believed (see `improvo.odometry.verdict`)."""
 
     window: int = 12  # keyframes that are adjusted together from each part of the evidence; half of them overlap
     # What a change of scale between two windows moves the path by: % of it for a change by the factor e. Calibrated on
@@ -116,7 +116,7 @@ class VerdictSettings:
 
 @dataclass(frozen=True)
 class BridgingSettings:
-    """When a new map is joined with that of a segment that ended before (see `improvo.odometry.bridging`)."""
+    """When a new map is joined with that of a segment that ended before (see `improvo.odometry.mapping.bridging`)."""
 
     max_frames: int = 300  # since the former segment's last frame; 0 joins nothing
     max_scale_error: float = 0.05  # standard error of the scale between both, relative
@@ -128,7 +128,7 @@ class BridgingSettings:
 
 @dataclass(frozen=True)
 class AttachedSettings:
-    """What moves with the camera, such as a logo, is kept out of the map (see `improvo.odometry.attached`)."""
+    """What moves with the camera, such as a logo, is kept out of the map (see `improvo.odometry.alarms.attached`)."""
 
     enabled: bool = True
     noise: float = 1.5  # pixels (of a width of 640, or less) that a keypoint of something attached may move
@@ -154,7 +154,7 @@ class RansacGateSettings:
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """When a keypoint goes to where its map point's patch lies (see `improvo.odometry.keypoint_refinement`)."""
+    """When a keypoint goes to where its map point's patch lies (see `improvo.odometry.refinement`)."""
 
     frontends: Literal["networks", "all", "none"] = "networks"  # SIFT gains on one recording and loses on another
     max_start: float = 3.0  # pixels between keypoint and projection; a search begins at the projection only within

@@ -14,9 +14,9 @@ from improvo.frontend.registry import CLASSICAL
 from improvo.geometry.camera import Camera
 from improvo.odometry.checks import OneThread, check_features, check_frame, check_time
 from improvo.odometry.events import Event, EventLog
-from improvo.odometry.keypoint_refinement import prepared
 from improvo.odometry.mapper import Mapper
 from improvo.odometry.paper import PaperMapper
+from improvo.odometry.refinement.keypoint_refinement import prepared
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.robust import RobustMapper
 from improvo.odometry.segments import Segment

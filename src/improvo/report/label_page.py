@@ -14,7 +14,7 @@ from improvo.odometry.run_folder import RunFolder
 from improvo.report.map_picture import map_png
 from improvo.report.page import Page, plain
 from improvo.report.palettes import PALETTES, Palette
-from improvo.report.plain_words import warnings
+from improvo.report.plain_words import LABEL_WORDS, warnings
 
 _MAX_MAPS = 12
 _MAX_NAMES = 3  # of recordings, in the title
@@ -49,9 +49,7 @@ def write_label_page(folder: Path, path: Path, palette: Palette = PALETTES["pape
     page.heading("Sequences")
     page.table(_COLUMNS, [[_words(row[name]) for name in _COLUMNS] for row in rows])
     page.paragraph(
-        "Withheld: tracks whose label the quality gate took away, because the odometry is not to be trusted where "
-        "they were seen.",
-        note=True,
+        "Columns of tracks: stable ones fit the camera's motion, unstable ones contradict it. " + LABEL_WORDS, note=True
     )
     for run in runs[:_MAX_MAPS]:
         page.html(f"<h3>{plain(run.name)}</h3>")
@@ -62,7 +60,7 @@ def write_label_page(folder: Path, path: Path, palette: Palette = PALETTES["pape
         if len(run.trajectory) and not plots_installed():
             page.paragraph(f"Its map, seen from above: {PLOTS_MISSING}.", note=True)
         elif len(run.trajectory):
-            page.picture(map_png(run, palette), f"{run.name} from above")
+            page.picture(map_png(run, palette), f"{run.name} from above", map_png(run, palette, narrow=True))
     page.write(path)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from improvo.types import SparseMap, UInt8
 _BACKGROUND = "#565b63"  # neither the paper's black (last window) nor its white (points)
 _DOUBTED = "#ff4fd8"  # a band under the path, which no ramp of the palettes has
 LAST_POSES = 30  # N_last
+_NARROW, _NARROW_LINE = 3.8, 60  # inches, and letters of the title in a line, on a telephone
 _DARKEST = 70  # grey level in which black points are drawn
 
 
@@ -35,8 +37,16 @@ def draw_map(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"], l
         temporary.write_bytes(picture)
 
 
-def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: int = LAST_POSES) -> bytes:
+def map_png(
+    run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: int = LAST_POSES, narrow: bool = False
+) -> bytes:
     """A PNG: points in their own colours, the trajectory from blue to red over time, the last window black.
+
+    Args:
+        run: the finished run.
+        palette: of the trajectory.
+        last_poses: that are drawn black.
+        narrow: for a telephone: as wide as its screen in inches, so that letters have the size that they are given.
 
     Raises:
         InputError: no frame of the run has a pose.
@@ -56,12 +66,15 @@ def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: in
     points_2d = axes_of_world.project(run.map.xyz[shown])
     low, high = robust_limits(path_2d, points_2d)
     width, height = _figure_size(high - low)
+    if narrow:
+        width, height = _NARROW, height * _NARROW / width + 0.6
     figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     axis = figure.subplots()
     axis.set_facecolor(_BACKGROUND)
     inside = ((points_2d > low) & (points_2d < high)).all(axis=1)
     size, alpha = _point_style(int(inside.sum()))
+    size *= 0.4 if narrow else 1.0
     axis.scatter(
         points_2d[inside, 0],
         points_2d[inside, 1],
@@ -119,10 +132,13 @@ def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: in
     unit = "metres" if run.unit.startswith("metres") else "map units: the first median depth is 1"
     axis.set_xlabel(f"right of the first camera ({unit})", fontsize=8)
     axis.set_ylabel("ahead of the first camera", fontsize=8)
-    axis.set_title(_title(run, len(shown), int((~inside).sum()), truth), fontsize=10)
+    title = _title(run, len(shown), int((~inside).sum()), truth)
+    if narrow:
+        title = "\n".join(textwrap.fill(line, _NARROW_LINE) for line in title.splitlines())
+    figure.suptitle(title, fontsize=8 if narrow else 10)
     _time_bar(figure, axis, palette, run.frames, len(last))
     png = io.BytesIO()
-    figure.savefig(png, dpi=150, format="png", bbox_inches="tight", metadata={"Software": None})
+    figure.savefig(png, dpi=220 if narrow else 150, format="png", bbox_inches="tight", metadata={"Software": None})
     return png.getvalue()
 
 

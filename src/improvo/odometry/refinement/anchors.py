@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from improvo.odometry.patch_alignment import REACH, patch_middles
+from improvo.odometry.refinement.patch_alignment import REACH, patch_middles
 from improvo.types import Float32, Float64, Int64, Mask
 
 _FIRST = 1024  # slots; they double

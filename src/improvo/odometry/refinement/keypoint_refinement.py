@@ -15,8 +15,8 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.odometry.anchors import Anchors
-from improvo.odometry.patch_alignment import align, cut_patches, repeated, warps_between
+from improvo.odometry.refinement.anchors import Anchors
+from improvo.odometry.refinement.patch_alignment import align, cut_patches, repeated, warps_between
 from improvo.odometry.settings import RefinementSettings
 from improvo.odometry.view import PointStore, View
 from improvo.types import Float64, Int64, UInt8

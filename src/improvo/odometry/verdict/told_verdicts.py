@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from improvo.odometry.verdict import DOUBTFUL, NOT_JUDGED
+from improvo.odometry.verdict.verdict import DOUBTFUL, NOT_JUDGED
 from improvo.odometry.view import Mask
 from improvo.types import Int64
 

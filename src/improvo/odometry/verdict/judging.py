@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from improvo.geometry.camera import Camera
-from improvo.odometry.evidence import EvidenceCheck
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.verdict import Verdict, judge
+from improvo.odometry.verdict.evidence import EvidenceCheck
+from improvo.odometry.verdict.verdict import Verdict, judge
 from improvo.odometry.view import View
 from improvo.types import Float64
 

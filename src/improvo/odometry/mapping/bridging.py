@@ -12,7 +12,7 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.alignment import Similarity
-from improvo.odometry.former_map import FormerMap, Sighting
+from improvo.odometry.mapping.former_map import FormerMap, Sighting
 from improvo.odometry.settings import BridgingSettings
 from improvo.odometry.view import View
 from improvo.types import Float64

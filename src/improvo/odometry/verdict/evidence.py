@@ -19,9 +19,9 @@ from improvo.errors import InputError
 from improvo.geometry import se3
 from improvo.geometry.alignment import align_points
 from improvo.geometry.camera import Camera
-from improvo.odometry.evidence_window import EvidenceKeyframe, EvidenceWindow
-from improvo.odometry.lens_evidence import LensMeasure, measured_lens
 from improvo.odometry.settings import VerdictSettings
+from improvo.odometry.verdict.evidence_window import EvidenceKeyframe, EvidenceWindow
+from improvo.odometry.verdict.lens_evidence import LensMeasure, measured_lens
 from improvo.odometry.view import Mask, View
 from improvo.types import Float64, Int64
 

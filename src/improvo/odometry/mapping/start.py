@@ -9,11 +9,11 @@ import numpy as np
 from improvo.backend.settings import SolverSettings
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.odometry.initial_pair import InitFailure, InitialPair, initial_pair
-from improvo.odometry.local_map import LocalMap
+from improvo.odometry.mapping.initial_pair import InitFailure, InitialPair, initial_pair
+from improvo.odometry.mapping.local_map import LocalMap
+from improvo.odometry.mapping.window import adjust
 from improvo.odometry.settings import OdometrySettings, WindowSettings
 from improvo.odometry.view import View, common_tracks
-from improvo.odometry.window import adjust
 
 _SOLVER = SolverSettings(max_iterations=30, relative_decrease=1e-4)  # of the first pair, and of all views at the end
 

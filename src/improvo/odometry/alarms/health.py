@@ -17,8 +17,8 @@ from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.geometry.epipolar import sampson_errors
 from improvo.geometry.ransac import Ransac, relative_pose
+from improvo.odometry.alarms.two_motions import holds_beside
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.two_motions import holds_beside
 from improvo.odometry.view import View, matches_of_world, ransac_pairs
 from improvo.tracking.matching import match_units
 from improvo.types import Int64

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from improvo.odometry.evidence import HALVES, PARTS, QUARTERS, Spread
 from improvo.odometry.settings import VerdictSettings
+from improvo.odometry.verdict.evidence import HALVES, PARTS, QUARTERS, Spread
 from improvo.types import Float64
 
 _NOISE_POWER = 3  # noise of 1.4 times the usual one came with 3 to 5 times the spread (docs/robustness-odometry.md)

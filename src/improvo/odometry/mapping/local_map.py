@@ -11,8 +11,8 @@ from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.geometry.ransac import Ransac, absolute_pose
 from improvo.geometry.triangulation import triangulate_tracks
-from improvo.odometry.keypoint_refinement import KeypointRefiner
-from improvo.odometry.projection_search import match_by_projection
+from improvo.odometry.mapping.projection_search import match_by_projection
+from improvo.odometry.refinement.keypoint_refinement import KeypointRefiner
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_points, ransac_rows
 from improvo.tracking.matching import match_units

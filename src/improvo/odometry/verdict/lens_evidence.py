@@ -13,7 +13,7 @@ import numpy as np
 from improvo.backend.settings import ObjectiveSettings, SolverSettings
 from improvo.backend.solver import solve
 from improvo.geometry.camera import Camera
-from improvo.odometry.evidence_window import EvidenceWindow
+from improvo.odometry.verdict.evidence_window import EvidenceWindow
 
 _STEP = 0.15  # of the logarithm of the focal length, to both sides
 _FARTHEST = 0.7  # a parabola through three costs says nothing of what lies farther off
