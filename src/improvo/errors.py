@@ -1,6 +1,8 @@
 """The exceptions of improvo: one base, caught once by the command line. And whether an optional package is there."""
 
+from importlib import import_module
 from importlib.util import find_spec
+from typing import Any
 
 
 class ImprovoError(Exception):
@@ -59,3 +61,20 @@ def installed(package: str) -> bool:
         return find_spec(package) is not None
     except ValueError:  # made unavailable by hand: None in sys.modules
         return False
+
+
+def imported(package: str, feature: str, extra: str) -> Any:
+    """An optional package.
+
+    Args:
+        package: its name.
+        feature: what needs it, as `MissingExtraError` says it.
+        extra: that brings it.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        return import_module(package)
+    except ImportError:
+        raise MissingExtraError(feature, extra) from None
