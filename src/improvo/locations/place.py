@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from improvo.errors import InputError, MissingExtraError, OutputError
+from improvo.errors import InputError, MissingExtraError, OutputError, imported
 
 Answer = TypeVar("Answer")
 
@@ -50,10 +50,7 @@ class Place:
     def fs(self) -> Any:
         """The file system, of this process: connections do not survive a fork."""
         if self._process != os.getpid():
-            try:
-                import fsspec
-            except ImportError:
-                raise MissingExtraError(f"{self.url}", "remote") from None
+            fsspec = imported("fsspec", self.url, "remote")
             try:
                 options: dict[str, Any] = {"skip_instance_cache": True} if self._process != -1 else {}
                 on_s3 = self.url.startswith(("s3:", "s3a:"))
