@@ -12,12 +12,13 @@ from improvo.odometry.run_settings import RunSettings
 from improvo.odometry.settings import OdometrySettings
 from improvo.sequences.base import SequenceSettings
 from improvo.stability.settings import LabelSettings
+from improvo.training.descriptor_metric import MetricSettings
 from improvo.training.held_settings import DevicePairSettings, HeldSettings
 from improvo.training.settings import OdometryTrainingSettings, OptimiserSettings
 
 DEFAULT_START = "superpoint-small"  # on a CPU a step takes a quarter of the time of one of `superpoint`
-HELD, TRACKS = "held", "tracks"
-RECIPES = (HELD, TRACKS)
+HELD, METRIC, TRACKS = "held", "metric", "tracks"
+RECIPES = (HELD, METRIC, TRACKS)
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,8 @@ class ImproveSettings:
     labels: LabelSettings = field(default_factory=LabelSettings)
     split: SplitSettings = field(default_factory=SplitSettings)
     reference: ReferenceSettings = field(default_factory=ReferenceSettings)
-    # held: descriptors from dense pairs of frames, the other heads held to the start's. tracks: all heads from tracks
+    # held: descriptors from dense pairs of frames, the other heads held to the start's. metric: a linear map of the
+    # descriptors from such pairs, in closed form. tracks: all heads from tracks
     recipe: str = HELD
     control: bool = False  # also train, from the same start, by homographies of the same frames alone, and show it
     minutes: float = 0.0  # that training may take in each round; 0: as many steps as the following say
@@ -105,6 +107,7 @@ class ImproveSettings:
             ),
         )
     )
+    metric: MetricSettings = field(default_factory=MetricSettings)  # of the recipe `metric`
     training: OdometryTrainingSettings = field(  # of the recipe `tracks`
         default_factory=lambda: OdometryTrainingSettings(
             optimiser=OptimiserSettings(steps=1000, decay_steps=350, learning_rate=5e-4)
@@ -114,7 +117,7 @@ class ImproveSettings:
 
     def __post_init__(self) -> None:
         if self.recipe not in RECIPES:
-            raise ConfigError(f"recipe `{self.recipe}`: unknown; choose {' or '.join(RECIPES)}")
+            raise ConfigError(f"recipe `{self.recipe}`: unknown; choose among {', '.join(RECIPES)}")
         for name in ("minutes", "steps_per_frame"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ConfigError(f"{name}={getattr(self, name):g}: must be 0 or more")
@@ -123,8 +126,8 @@ class ImproveSettings:
 
     @property
     def teaches_labels(self) -> bool:
-        """Whether a round trains with the labels of the training part; whole frames have depth and poses instead."""
-        return self.recipe != HELD or not self.held.pairs.whole_frames
+        """Whether a round trains with the labels of the training part; the others teach depth and poses."""
+        return self.recipe == TRACKS or (self.recipe == HELD and not self.held.pairs.whole_frames)
 
     def run_settings(self, sequence: SequenceSettings, frontend: FrontendSettings) -> RunSettings:
         """The odometry's settings for some frames and a frontend."""
