@@ -473,13 +473,15 @@ def test_no_pair_of_any_kind_has_a_point_on_a_masked_pixel() -> None:
     shown = tuple(np.where(below, np.maximum(picture, 80), np.uint8(0)) for picture in room.pictures)
     masked = replace(source, pictures=painted, masks=(left,) * len(painted))
     seen = replace(room, pictures=shown, masks=(below,) * len(shown))
-    for two_frames in (True, False):
-        settings = replace(SMALL, pairs=replace(SMALL.pairs, two_frames=two_frames))
-        batches = DevicePairs(Pictures((masked,)), [seen], settings, no_keypoints, None, CPU)
+    for two_frames, whole in ((True, 0), (False, 0), (True, 1)):
+        pairs = replace(SMALL.pairs, two_frames=two_frames, whole_frames=whole, alone=20, largest_gap=6.0)
+        batches = DevicePairs(Pictures((masked,)), [seen], replace(SMALL, pairs=pairs), no_keypoints, None, CPU)
         for step in range(3):
             batch = batches[step]
+            count = len(batch["valid"])
             for pair, valid in enumerate(batch["valid"]):
                 assert valid.any()
-                for name, image in (("points_a", pair), ("points_b", 4 + pair)):
-                    places = batch[name][pair][valid].round().long()
+                taught = {"points_a": (pair, batch["negative"]), "points_b": (count + pair, batch["negative_b"])}
+                for name, (image, used) in taught.items():
+                    places = batch[name][pair][used[pair]].round().long()
                     assert (batch["images"][image, 0][places[:, 1], places[:, 0]] > 40).float().mean() > 0.98

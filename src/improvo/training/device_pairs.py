@@ -270,9 +270,9 @@ class DevicePairs:
             visible[: plan.posed] = self.frames.shown(rows, carried, self.settings.pairs.depth_tolerance)
         sizes = on_device(self.store.sizes[plan.rows].astype(np.float32), points.device)
         if absent:
-            known = torch.ones_like(visible)
+            known = torch.ones_like(visible) if self.masks is None else self.masks.used(plan.rows[:, 0], in_a)
             if plan.posed:
-                known[: plan.posed] = inverse > 0
+                known[: plan.posed] &= inverse > 0
             there = warped(plan.view_from_picture[count:], in_b)
             size = on_device(np.array([plan.size], np.float32), there.device)
             margin = self.settings.masked_pixels
