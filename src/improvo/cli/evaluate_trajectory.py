@@ -11,7 +11,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import figures, next_after_figures
 from improvo.errors import InputError
 from improvo.evaluation.settings import ALIGNMENTS, TrajectoryCommandSettings, TrajectorySettings
@@ -34,7 +34,7 @@ TRAJECTORY_FLAGS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `improvo evaluate trajectory`."""
     parser.add_argument("estimate", type=Path, metavar="ESTIMATE")
-    parser.add_argument("against", type=Path, metavar="TRUTH")
+    parser.add_argument("against", type=recording_path, metavar="TRUTH")
     parser.add_argument(
         "--truth",
         metavar="FILE",

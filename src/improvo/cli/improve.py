@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rounds", type=int, default=1, metavar="N", help="of labelling, training and validation")
     parser.add_argument(
         "--evaluate",
-        type=Path,
+        type=recording_path,
         nargs="+",
         default=[],
         metavar="SEQUENCE",

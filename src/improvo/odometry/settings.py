@@ -86,7 +86,8 @@ class HealthSettings:
     gaps: tuple[int, ...] = (3, 6, 12)  # frames between the two views of a check
     epipolar_error: float = 1.5  # pixels
     min_inliers: int = 30  # of the two views' own essential matrix; fewer say nothing
-    min_inlier_share: float = 0.15  # of their matches
+    min_inlier_share: float = 0.4  # of their matches; fewer may agree by repeated texture
+    max_turn_deg: float = 5.0  # between both rotations; one farther off is of a mover or of repeated texture
     rounds: int = 3  # consecutive checks that are evaluated together
     min_evidence: int = 100  # inliers in all of them; fewer decide nothing
     min_agreement: float = 0.85  # right maps stay over 0.90, wrong ones fall under 0.80
