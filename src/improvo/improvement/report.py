@@ -45,7 +45,7 @@ def write_report(
     """
     start = validations[0]
     rounds = [
-        _round(candidate, validation, split, settings, pictures=number in (0, best))
+        _round(candidate, validation, split, settings, pictures=number in (0, best or len(candidates) - 1))
         for number, (candidate, validation) in enumerate(zip(candidates, validations, strict=True))
     ]
     if control:

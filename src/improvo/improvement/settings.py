@@ -126,8 +126,8 @@ class ImproveSettings:
 
     @property
     def teaches_labels(self) -> bool:
-        """Whether a round trains with the labels of the training part; whole frames have depth and poses instead."""
-        return self.recipe != HELD or not self.held.pairs.whole_frames
+        """Whether a round trains with the labels of the training part; the others teach depth and poses."""
+        return self.recipe == TRACKS or (self.recipe == HELD and not self.held.pairs.whole_frames)
 
     def run_settings(self, sequence: SequenceSettings, frontend: FrontendSettings) -> RunSettings:
         """The odometry's settings for some frames and a frontend."""

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from improvo.geometry.a_contrario import line_probability, log10_false_alarms
+from improvo.geometry.a_contrario import SIGNIFICANT, line_probability, log10_false_alarms
 from improvo.geometry.camera import Camera
 from improvo.geometry.epipolar import half_line_distances
 from improvo.geometry.ransac import Ransac, relative_pose
@@ -26,7 +26,6 @@ from improvo.types import Float64, Int64
 _COLUMNS, _ROWS = 16, 12  # cells of the picture
 _FEATURES = 600  # of each view, the strongest within the cells that are attached, or may be, and as many outside
 _MIN_MOVING = 20  # matches that moved; fewer say nothing about the camera
-_SIGNIFICANT = -6.0  # log10 of the number of false alarms of their essential matrix
 _MIN_SHARE = 0.5  # of them that agree with it
 _MOVED = 3.0  # times the noise: a match that moved so far did move
 _OFF = 1.5  # times the noise: a match so far from where a point of the world can be is not of it
@@ -150,7 +149,7 @@ class AttachedDetector:
         chance = line_probability(self._camera.width, self._camera.height, self._noise)
         inliers = int(world.inliers.sum())
         if inliers < _MIN_SHARE * len(moved) or (
-            log10_false_alarms(len(moved), inliers, chance, sample=5, models=10) > _SIGNIFICANT
+            log10_false_alarms(len(moved), inliers, chance, sample=5, models=10) > SIGNIFICANT
         ):
             self._suspect(cells[still], cells[moved])
             return

@@ -45,7 +45,7 @@ class HealthCheck:
 
     Args:
         camera: pinhole camera of the views.
-        settings: of the odometry; `health`, `ransac_gate` and `seed` are used.
+        settings: of the odometry; `health`, `ransac_gate`, `start` and `seed` are used.
         descriptor_distance: the matching threshold on unit descriptors.
     """
 
@@ -75,7 +75,9 @@ class HealthCheck:
                 earlier[view.frame_index - gap], view, self._camera, self._descriptor_distance, self._settings
             )
             two_motions |= found.two_motions
-            enough = found.own_inliers >= max(settings.min_inliers, settings.min_inlier_share * found.matches)
+            enough = found.own_inliers >= max(
+                self._settings.start.min_points, settings.min_inlier_share * found.matches
+            )
             if enough and found.turn_deg < settings.max_turn_deg and not found.two_motions:
                 counts[row] = found.map_inliers, found.own_inliers
         self._rounds.append(counts)

@@ -82,7 +82,7 @@ class LocalMap:
     def _is_lost(self, inliers: int, share: float) -> bool:
         loss = self._settings.loss
         outliers = inliers / share - inliers if share > 0 else 0.0
-        return inliers < loss.min_inliers + loss.wrong_share * outliers or share < loss.min_inlier_share
+        return inliers < loss.min_inliers + loss.wrong_share * outliers
 
     def _from_same_side(self, view: View, other: View) -> bool:
         """Whether a view sees its points from where another one, with a pose, can have seen the same of them.
