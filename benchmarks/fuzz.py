@@ -1,15 +1,17 @@
 """Damages small valid files of every kind that improvo reads, and looks whether each is read, or refused in one line.
 
-    PYTHONPATH=tests python benchmarks/fuzz.py [--minutes 60] [--seed 0] [--only NAME] [--corpus FOLDER]
+    PYTHONPATH=tests python benchmarks/fuzz.py [--minutes 60] [--each 200000] [--only NAME] [--corpus FOLDER]
 
-What counts as a fault: an error that is none of ours, one whose message has several lines or does not name the file, an
-execution of more than the time limit, a process that ends, or memory beyond the limit. Each fault is told once for each
-place in the code, and its file is kept in the corpus folder as `TARGET--SEED`, to be looked at with `--again FILE`.
+What counts as a fault: an error that is none of ours, one whose message has several lines, an execution that takes more
+processor time than the limit (or waits for ever), a process that ends, or memory beyond the limit. Each fault is told
+once for each place in the code, and its file is kept in the corpus folder as `TARGET--SEED`, to be looked at with
+`--again FILE`. Executions are counted in `record.json` beside them: the next run goes on with seeds that none has had.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import multiprocessing
 import os
 import random
@@ -19,7 +21,6 @@ import sys
 import tempfile
 import time
 import traceback
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
@@ -29,21 +30,64 @@ from typing import Any
 from fuzz_targets import EXPECTED, Target, targets  # of the tests: run with PYTHONPATH=tests
 from mutations import mutated
 
-SECONDS, MEGABYTES = 20.0, 4000  # of one execution, of a child process
-EXAMPLE_SECONDS = 600.0  # of making the example that is damaged
-BATCH, TURN_SECONDS = 500, 8.0  # executions of one child, at most, and how long a target's turn lasts
+SECONDS, MEGABYTES = 20.0, 4000  # of one execution (processor time), of a child process
+WAITING_SECONDS = 900.0  # of an execution that does nothing
+TURN_SECONDS = 30.0  # executions of one child; a new one costs a fork and a new example
 PACKAGE = "improvo"
+SCRATCH = Path("/dev/shm") if Path("/dev/shm").is_dir() else None  # the files are written and read in memory
 
 
 class TooSlowError(BaseException):
     """An execution took more than the time limit; no parser may catch this."""
 
 
+class Record:
+    """How often each target was executed, over all runs, and the faults that were found."""
+
+    def __init__(self, path: Path, first_seed: int) -> None:
+        self._path, self._first_seed = path, first_seed
+        self.targets: dict[str, dict[str, float]] = {}
+        self.faults: dict[str, str] = {}  # target and place -> the first file that shows it
+        if path.exists():
+            content = json.loads(path.read_text())
+            self.targets, self.faults = content["targets"], content["faults"]
+
+    def of(self, name: str) -> dict[str, float]:
+        """What is known of a target."""
+        return self.targets.setdefault(name, {"executions": 0, "next_seed": self._first_seed, "processor_seconds": 0.0})
+
+    def seconds_left(self, name: str, each: int) -> float:
+        """The processor time that a target still needs for that many executions; none if it never ran."""
+        one = self.of(name)
+        return (each - one["executions"]) * one["processor_seconds"] / max(one["executions"], 1)
+
+    def save(self) -> None:
+        """Write it whole."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = self._path.with_suffix(".new")
+        temporary.write_text(json.dumps({"targets": self.targets, "faults": self.faults}, indent=1))
+        temporary.replace(self._path)
+
+    def table(self, names: list[str]) -> str:
+        """A line per target: executions, executions a second of processor time, faults."""
+        lines = []
+        for name in names:
+            one = self.of(name)
+            rate = one["executions"] / max(one["processor_seconds"], 1e-9)
+            faults = sum(key.startswith(f"{name}: ") for key in self.faults)
+            lines.append(f"  {name:28} {one['executions']:9.0f} {rate:8.0f}/s {faults:4}")
+        return "\n".join(lines)
+
+
 def main() -> None:
-    """Round and round over the targets until the time is up."""
+    """Round and round over the targets until the time is up or each has had its executions."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="of the first execution of a target that has had none")
+    parser.add_argument("--each", type=int, default=200_000, help="executions of a target, all runs together")
+    parser.add_argument(
+        "--finish", action="store_true", help="not in turns: always the target that lacks the least processor time"
+    )
     parser.add_argument("--only", nargs="*", default=[], metavar="NAME", help="targets whose names begin so")
     parser.add_argument("--corpus", type=Path, default=Path("output/fuzz"), metavar="FOLDER")
     parser.add_argument("--again", type=Path, metavar="FILE", help="one file of the corpus, with the whole traceback")
@@ -52,76 +96,92 @@ def main() -> None:
         again(arguments.again)
         return
     names = [name for name in targets() if not arguments.only or name.startswith(tuple(arguments.only))]
+    record = Record(arguments.corpus / "record.json", arguments.seed)
+    known = len(record.faults)
     end = time.monotonic() + 60 * arguments.minutes
-    executions: Counter[str] = Counter()
-    faults: dict[str, str] = {}  # where -> the first file that shows it
-    seed = arguments.seed
     while time.monotonic() < end:
-        for name in names:
-            for kind, place, number in child_results(name, seed, min(end, time.monotonic() + TURN_SECONDS)):
-                executions[name] += kind != "fault"
-                if kind == "fault" and f"{name}: {place}" not in faults:
-                    faults[f"{name}: {place}"] = keep(name, number, arguments.corpus)
-                    print(f"{name}: {place}\n    {faults[f'{name}: {place}']}", flush=True)
+        waiting = [name for name in names if record.of(name)["executions"] < arguments.each]
+        if not waiting:
+            break
+        if arguments.finish:
+            waiting = [min(waiting, key=lambda name: record.seconds_left(name, arguments.each))]
+        for name in waiting:
+            one_turn(name, record, arguments.each, min(end, time.monotonic() + TURN_SECONDS), arguments.corpus)
+            record.save()
             if time.monotonic() > end:
                 break
-        seed += BATCH
-    print(f"\n{sum(executions.values())} executions of {len(executions)} targets, {len(faults)} faults")
-    for name, count in sorted(executions.items()):
-        print(f"  {name:28} {count:8} {sum(key.startswith(f'{name}: ') for key in faults):4}")
-    sys.exit(1 if faults else 0)
+    print(record.table(names))
+    done = sum(record.of(name)["executions"] >= arguments.each for name in names)
+    print(f"{done} of {len(names)} targets had {arguments.each} executions; {len(record.faults) - known} new faults")
+    sys.exit(1 if len(record.faults) > known else 0)
 
 
-def child_results(name: str, seed: int, end: float) -> Iterator[tuple[str, str, int]]:
-    """(`done` or `fault`, place, seed) of a batch; a child that dies or hangs is a fault of what it was doing."""
-    done = 0
-    while done < BATCH and time.monotonic() < end:
-        ours, theirs = multiprocessing.Pipe(duplex=False)
-        process = multiprocessing.get_context("fork").Process(target=batch, args=(name, seed, done, theirs, end))
-        process.start()
-        patience = EXAMPLE_SECONDS
-        theirs.close()
-        while True:
-            try:
-                if not ours.poll(patience):
-                    process.kill()
-                    yield "fault", f"hangs for {patience:g} s", seed + done
-                    break
-                kind, place = ours.recv()
-                patience = 2 * SECONDS
-            except EOFError:
-                process.join()
-                if process.exitcode:
-                    yield "fault", f"the process ends with {process.exitcode}", seed + done
-                break
-            if kind == "end":
-                process.join()
-                return
-            if kind != "begin":
-                yield kind, place, seed + done
-            done += kind == "done"
-        process.join()
-        done += 1
+def one_turn(name: str, record: Record, most: int, end: float, corpus: Path) -> None:
+    """Executions of one target in a child; a child that dies or hangs is a fault of what it was doing."""
+    one = record.of(name)
+    first = int(one["next_seed"])
+    count = int(most - one["executions"])
+    shared = multiprocessing.RawArray("d", [first - 1, 0.0])  # the seed that is tried, processor seconds so far
+    ours, theirs = multiprocessing.Pipe(duplex=False)
+    process = multiprocessing.get_context("fork").Process(target=turn, args=(name, first, count, shared, theirs, end))
+    process.start()
+    theirs.close()
+
+    def fault(place: str, seed: int) -> None:
+        if (key := f"{name}: {place}") not in record.faults:
+            record.faults[key] = keep(name, seed, corpus)
+            print(f"{key}\n    {record.faults[key]}", flush=True)
+
+    seed, since, used = first - 1, time.monotonic(), 0.0
+    while True:
+        if ours.poll(1.0):
+            with suppress(EOFError):
+                fault(*ours.recv())
+                continue
+            process.join()
+            if process.exitcode:
+                fault(f"the process ends with {process.exitcode}", int(shared[0]))
+            break
+        if int(shared[0]) != seed:
+            seed, since, used = int(shared[0]), time.monotonic(), processor_seconds(process.pid)
+        elif seed < first:
+            continue  # the example is being made
+        elif processor_seconds(process.pid) - used > 2 * SECONDS or time.monotonic() - since > WAITING_SECONDS:
+            process.kill()
+            process.join()
+            fault(f"hangs; {processor_seconds(process.pid) - used:.0f} s of processor time", seed)
+            break
+    one["executions"] += int(shared[0]) - first + 1
+    one["next_seed"] = int(shared[0]) + 1
+    one["processor_seconds"] += shared[1]
 
 
-def batch(name: str, seed: int, first: int, results: Connection, end: float) -> None:
+def turn(name: str, first: int, count: int, shared: Any, results: Connection, end: float) -> None:
     """In a child: executions by seed, from `first` on; none of them may leave it unusable for the next."""
     limit_memory()
     sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
     os.dup2(sys.stdout.fileno(), 2)
     target = targets()[name]
-    with tempfile.TemporaryDirectory(prefix="improvo-fuzz-") as place:
+    with tempfile.TemporaryDirectory(prefix="improvo-fuzz-", dir=SCRATCH) as place:
         example = Example(target, Path(place) / "example")
-        results.send(("begin", ""))  # making the example does not count
-        for number in range(first, BATCH):
+        before = time.process_time()  # making the example does not count
+        for seed in range(first, first + count):
             if time.monotonic() > end:
                 break
-            fault = example.try_seed(seed + number)
+            shared[0] = seed
+            fault = example.try_seed(seed)
+            shared[1] = time.process_time() - before
             if fault:
-                results.send(("fault", fault))
-            results.send(("done", ""))
-    with suppress(OSError):
-        results.send(("end", ""))
+                results.send((fault, seed))
+
+
+def processor_seconds(pid: int | None) -> float:
+    """Used so far by a process that runs; 0 of one that has ended."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 class Example:
@@ -169,17 +229,17 @@ def described(error: BaseException) -> str:
 
 @contextmanager
 def time_limit() -> Iterator[None]:
-    """Raise in the main thread when the time is up."""
+    """Raise in the main thread when the processor time is up; others on the machine do not count."""
 
     def stop(*_: Any) -> None:
         raise TooSlowError(f"more than {SECONDS:g} s")
 
-    signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
 
 
 def limit_memory() -> None:

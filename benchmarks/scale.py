@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import shutil
 import subprocess
@@ -38,6 +39,8 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True, help="for stores and results; kept")
     parser.add_argument("--frames", type=int, nargs="+")
     parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--width", type=int, help="of the frames to label")
     parser.add_argument("--frontend", default="superpoint", help="weights to train, or to label with")
     parser.add_argument("--json", type=Path, help="write the figures here")
     arguments = parser.parse_args()
@@ -45,7 +48,8 @@ def main() -> None:
         print(json.dumps(one_training(arguments.sequences[0], arguments.folder, arguments.steps, arguments.frontend)))
         return
     if arguments.what == "one-labelling":
-        print(json.dumps(one_labelling(arguments.sequences[0], arguments.folder, arguments.frontend)))
+        recording, width = arguments.sequences[0], arguments.width
+        print(json.dumps(one_labelling(recording, arguments.folder, arguments.frontend, width)))
         return
     rows = MEASURES[arguments.what](arguments)
     for row in rows:
@@ -115,19 +119,30 @@ def one_training(store: Path, output: Path, steps: int, frontend: str) -> dict[s
 
 
 def workers(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """Seconds with one worker and with two, three times in turn."""
-    rows = []
-    for repeat in range(3):
+    """Seconds with one worker and with two in turn, and how much of the machine others took meanwhile."""
+    rows: list[dict[str, Any]] = []
+    for repeat in range(arguments.repeats):
         for count in (1, 2):
             store = arguments.folder / f"labels-by-{count}"
             shutil.rmtree(store, ignore_errors=True)
-            before = time.perf_counter()
             command = ["label", *map(str, arguments.sequences), "-o", str(store), "--workers", str(count)]
+            command += ["--frontend", arguments.frontend, *_width(arguments)]
+            before, own, busy = time.perf_counter(), _children_seconds(), _busy_seconds()
             subprocess.run([sys.executable, "-m", "improvo", *command], check=True, stdout=subprocess.DEVNULL)
-            rows.append({"repeat": repeat, "workers": count, "seconds": round(time.perf_counter() - before, 1)})
+            wall, own = time.perf_counter() - before, _children_seconds() - own
+            others = _busy_seconds() - busy - own
+            row = {"repeat": repeat, "workers": count, "seconds": round(wall, 1), "processor": round(own, 1)}
+            rows.append({**row, "others' cores": round(others / wall, 2)})
         one, two = rows[-2:]
         two["times as fast"] = round(one["seconds"] / two["seconds"], 2)
+        two["processor ratio"] = round(two["processor"] / one["processor"], 3)
     return rows
+
+
+def _busy_seconds() -> float:
+    """Processor time of everything on this machine since it started."""
+    user, nice, system, _, _, irq, soft, steal = map(int, Path("/proc/stat").read_text().split()[1:9])
+    return (user + nice + system + irq + soft + steal) / os.sysconf("SC_CLK_TCK")
 
 
 def labelling(arguments: argparse.Namespace) -> list[dict[str, Any]]:
@@ -144,38 +159,49 @@ def labelling(arguments: argparse.Namespace) -> list[dict[str, Any]]:
             picture = pictures[min(row, 2 * len(pictures) - 2 - row)]
             (recording / f"{number:06d}{picture.suffix}").symlink_to(picture.resolve())
         shutil.copy(arguments.sequences[0] / "camera.yaml", recording)
-        options = ["--frontend", arguments.frontend]
+        options = ["--frontend", arguments.frontend, *_width(arguments)]
         rows.append(
             {"frames": frames, **_in_a_process("one-labelling", str(recording), "--folder", str(output), *options)}
         )
     return rows
 
 
-def one_labelling(recording: Path, output: Path, frontend: str) -> dict[str, Any]:
-    """In a process of its own, as a worker does it."""
+def one_labelling(recording: Path, output: Path, frontend: str, width: int | None) -> dict[str, Any]:
+    """In a process of its own, as a worker does it; memory is looked at every thousand frames."""
     from improvo.frontend.settings import FrontendSettings
     from improvo.jobs.workers import start_worker
     from improvo.labeling.label_sequences import label_sequences
     from improvo.odometry.run_settings import LabelRunSettings
+    from improvo.sequences.base import SequenceSettings
 
     start_worker()
-    settings = LabelRunSettings(frontend=FrontendSettings(name=frontend))
-    (record,) = label_sequences([recording], output, settings)
+    settings = LabelRunSettings(frontend=FrontendSettings(name=frontend), sequence=SequenceSettings(width=width))
+    done, seen = 0, list[int]()
+
+    def on_frames(count: int) -> None:
+        nonlocal done
+        done += count
+        if done % 1000 == 0:
+            seen.append(_resident_mib())
+            print(done, seen[-1], file=sys.stderr, flush=True)
+
+    (record,) = label_sequences([recording], output, settings, pack=True, on_frames=on_frames)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // _KIB_PER_MIB
-    return {"tracked": record.tracked, "peak_mib": peak, "seconds": record.seconds}
+    return {"tracked": record.tracked, "peak_mib": peak, "each_1000_frames_mib": seen, "seconds": record.seconds}
+
+
+def _resident_mib() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") >> 20
+
+
+def _width(arguments: argparse.Namespace) -> list[str]:
+    return [] if arguments.width is None else ["--width", str(arguments.width)]
 
 
 def plan(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """Core-seconds as planned, and as one worker process then takes them."""
-    command = [
-        sys.executable,
-        "-m",
-        "improvo",
-        "label",
-        *map(str, arguments.sequences),
-        "--frontend",
-        arguments.frontend,
-    ]
+    command = [sys.executable, "-m", "improvo", "label", *map(str, arguments.sequences)]
+    command += ["--frontend", arguments.frontend, *_width(arguments)]
     said = subprocess.run([*command, "--plan", "--json"], check=True, stdout=subprocess.PIPE, text=True).stdout
     planned = json.loads(said)
     store = arguments.folder / "labels-planned"

@@ -336,10 +336,20 @@ def _own_targets() -> dict[str, Target]:
     from improvo.files import check_output_folder, make_output_folder
     from improvo.improvement.split import Part, Split, remembered_split
     from improvo.improvement.validation import GapScores, Validation, read_validation, write_validation
+    from improvo.labeling.frames import FRAMES_FILE, FramesTable, PackedImages, pack_images, read_frames, write_frames
     from improvo.labeling.labeled import read_labels
     from improvo.odometry.map_file import read_map, write_map
     from improvo.odometry.run_folder import RunFolder, why_no_pose
     from improvo.sequences import SequenceSettings
+    from improvo.stability.tables import (
+        POINTS_FILE,
+        TRACKS_FILE,
+        PointsTable,
+        PointsWriter,
+        TracksWriter,
+        read_points,
+        read_tracks,
+    )
     from improvo.types import SparseMap
     from labeled_scene import write_labeled_scene
 
@@ -349,6 +359,22 @@ def _own_targets() -> dict[str, Target]:
     def read_store(path: Path) -> None:
         for one in read_labels(next(parent for parent in path.parents if parent.name == "labels")):
             _ = one.camera, one.tracks, one.points, one.frames, one.cam_from_world, one.image(0)
+
+    def short_table(name: str, folder: Path) -> Path:
+        """Each table of a label store with three rows, for its own reader."""
+        frames, track = np.arange(3), np.zeros(3, np.int64)
+        ones, yes = np.ones(3), np.ones(3, np.bool_)
+        write_frames(folder / FRAMES_FILE, FramesTable(frames, frames, ones, track, yes))
+        with PointsWriter(folder / POINTS_FILE) as points:
+            points.write(PointsTable(frames, frames, np.ones((3, 3)), ones, ones, ones, yes + 0, track, ones, yes))
+        with TracksWriter(folder / TRACKS_FILE) as tracks:
+            tracks.write(frames, track, np.ones((3, 2), np.float32), ones, ones)
+        pack_images(folder, [(image, None) for image in images(2)])
+        return folder / name
+
+    def read_packed(path: Path) -> None:
+        packed = PackedImages(path.parent)
+        _ = packed.image(0), packed.mask(0), packed.image(1)
 
     def ply(folder: Path) -> Path:
         ints = np.arange(4)
@@ -396,6 +422,10 @@ def _own_targets() -> dict[str, Target]:
     targets = {
         f"store-{name}": Target(partial(store, f"walls/{name}"), read_store, text=name.endswith((".json", ".txt")))
         for name in (*names, "images-00000.parquet")
+    }
+    readers = {"tracks": read_tracks, "points": read_points, "frames": read_frames, "images-00000": read_packed}
+    targets |= {
+        f"{name}.parquet": Target(partial(short_table, f"{name}.parquet"), read) for name, read in readers.items()
     }
     targets["store-settings.yaml"] = Target(partial(store, "settings.yaml"), read_store, True)
     targets["run.json"] = Target(run_folder, read_run, True)

@@ -119,6 +119,22 @@ def test_a_finished_work_is_used_again_and_a_bad_truth_is_not_written(
     assert step[1] / step[0] == pytest.approx(0.5, abs=0.01)
 
 
+def test_masked_pixels_have_no_features(walk: Path, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
+    mask[:, : CAMERA.width // 3] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    out = tmp_path / "truth.txt"
+    given = ["truth", str(walk), "-o", str(out), "--end", "6", "--quiet", "--calibrate", "none"]
+    main([*given, "--mask", str(tmp_path / "mask.png")])  # whether six frames are enough for a truth is no matter
+    database = pycolmap.Database.open(tmp_path / "truth.work" / "database.db")
+    x = np.concatenate([database.read_keypoints(image.image_id)[:, 0] for image in database.read_all_images()])
+    database.close()
+    assert len(x) > 300
+    assert x.min() > CAMERA.width // 3 + 5  # the border counts as masked
+    assert main(given) == 2  # the same working folder with other pixels
+
+
 def test_pairs_are_the_next_images_and_powers_of_two() -> None:
     pairs = image_pairs(40, overlap=3, farthest=16)
     assert sorted({int(b - a) for a, b in pairs}) == [1, 2, 3, 4, 8, 16]

@@ -18,6 +18,7 @@ from rendered_walk import write_walk
 
 from improvo.cli.main import main
 from improvo.errors import InputError, MissingExtraError
+from improvo.jobs.crew import Crew
 from improvo.jobs.on_ray import gpus_of, run_on_ray
 from improvo.jobs.processes import Tick
 from improvo.jobs.workers import WorkerDiedError
@@ -43,16 +44,49 @@ def tick_until_stopped(number: int, tick: Tick) -> None:
         time.sleep(0.01)
 
 
+class DyingCounter:
+    """As the actor that counts ticks, on a node that dies."""
+
+    def add(self, count: int) -> None:
+        os._exit(1)
+
+    def count(self) -> int:
+        return 0
+
+
+def wait_for_word(folder: Path, tick: Tick) -> str:
+    """Says which node it is on, and waits."""
+    import ray
+
+    node = ray.get_runtime_context().get_node_id()
+    with (folder / "nodes").open("a") as file:
+        file.write(f"{node}\n")
+    while not (folder.parent / "word").exists():
+        time.sleep(0.05)
+    return node
+
+
 @pytest.fixture(scope="module")
-def cluster():
-    """One local cluster for all tests: it takes long to start."""
-    ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'improvo[ray]'")
+def nodes():
+    """Two nodes on this machine, for all tests: they take long to start."""
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'improvo[ray]'")
+    from ray.cluster_utils import Cluster
+
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    cluster.add_node(num_cpus=1)
+    yield cluster
+    cluster.shutdown()
+
+
+@pytest.fixture(scope="module")
+def cluster(nodes):
+    """A connection to them, which the commands use."""
+    import ray
+
     python_path = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
     ray.init(
-        address="local",
-        num_cpus=2,
-        include_dashboard=False,
+        address=nodes.address,
         log_to_driver=False,
         runtime_env={"env_vars": {"PYTHONPATH": python_path}},
     )
@@ -83,6 +117,35 @@ def test_a_worker_that_dies_spoils_no_other_job(cluster):
     assert results == {2: 2, 3: 3, 4: 4}
 
 
+def test_a_job_is_worth_more_than_its_ticks(cluster, monkeypatch):
+    monkeypatch.setattr("improvo.jobs.on_ray._Counter", DyingCounter)
+    results, _ = run(halve, [4])
+    assert results[4][0] == 2
+
+
+def test_a_node_that_dies_costs_what_it_had_in_work(nodes, cluster, tmp_path):
+    third = nodes.add_node(num_cpus=1)
+    folders = [tmp_path / name for name in "abc"]
+    for folder in folders:
+        folder.mkdir()
+
+    def end_node() -> None:
+        ends = time.monotonic() + 120
+        while len(list(tmp_path.glob("*/nodes"))) < 3 and time.monotonic() < ends:
+            time.sleep(0.05)
+        nodes.remove_node(third, allow_graceful=False)
+        (tmp_path / "word").touch()
+
+    killer = threading.Thread(target=end_node)
+    killer.start()
+    found = Crew(workers=3, ray="local").results(wait_for_word, folders)
+    killer.join()
+    tried = [(folder / "nodes").read_text().split() for folder in folders]
+    assert sorted(map(len, tried)) == [1, 1, 2]
+    assert found == [nodes_of_it[-1] for nodes_of_it in tried]
+    assert third.node_id in {tries[0] for tries in tried}
+
+
 def test_an_interrupt_cancels_what_runs(cluster):
     def interrupt(count: int) -> None:
         raise KeyboardInterrupt
@@ -106,51 +169,63 @@ def test_labels_are_those_of_one_process(cluster, tmp_path, monkeypatch, capsys)
             assert (tmp_path / "there" / walk / name).read_bytes() == (tmp_path / "here" / walk / name).read_bytes()
 
 
+class Killer(threading.Thread):
+    """Ends the first worker process that is in the middle of labelling below a folder, with SIGKILL."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self._folder = folder
+        self.killed: list[int] = []
+
+    def run(self) -> None:
+        ends = time.monotonic() + 300
+        while not self.killed and time.monotonic() < ends:
+            for lock in self._folder.rglob(".*.lock"):
+                name = lock.name.removeprefix(".").removesuffix(".lock")
+                started = list((lock.parent / f".{name}.partial").glob(".tracks*"))
+                with contextlib.suppress(OSError, ValueError):
+                    process = json.loads(lock.read_text())["process"]
+                    if started and process != os.getpid():
+                        os.kill(process, signal.SIGKILL)
+                        self.killed.append(process)
+                        return
+            time.sleep(0.005)
+
+
 def test_a_worker_that_is_killed_in_the_middle_changes_nothing(cluster, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     walks = [write_walk(Path(name), frames=40, seed=seed) for seed, name in enumerate(("kitchen", "hall"))]
     words = ["label", *map(str, walks), "--frontend", "orb", "--max-keypoints", "200"]
     words += ["--set", "labels.min_observations=6", "--set", "labels.quality.enabled=false"]
     assert main([*words, "-o", "here"]) == 0
-    killed: list[int] = []
-
-    def kill() -> None:
-        ends = time.monotonic() + 300
-        while not killed and time.monotonic() < ends:
-            for lock in Path(tmp_path, "there").glob(".*.lock"):
-                name = lock.name.removeprefix(".").removesuffix(".lock")
-                started = list(Path(tmp_path, "there", f".{name}.partial").glob(".tracks*"))
-                with contextlib.suppress(OSError, ValueError):
-                    process = json.loads(lock.read_text())["process"]
-                    if started and process != os.getpid():
-                        os.kill(process, signal.SIGKILL)
-                        killed.append(process)
-                        return
-            time.sleep(0.005)
-
-    killer = threading.Thread(target=kill)
+    killer = Killer(tmp_path / "there")
     killer.start()
     assert main([*words, "-o", "there", "--ray", "local", "--workers", "2"]) == 0
     killer.join()
-    assert len(killed) == 1
+    assert len(killer.killed) == 1
     assert "2 of 2 sequences labelled" in capsys.readouterr().out
     for name in ("tracks.parquet", "points.parquet", "frames.parquet", "trajectory.txt"):
         for walk in ("kitchen", "hall"):
             assert (tmp_path / "there" / walk / name).read_bytes() == (tmp_path / "here" / walk / name).read_bytes()
 
 
-def test_a_loop_on_the_cluster_keeps_what_the_local_one_keeps(cluster, tmp_path):
+def test_a_loop_on_the_cluster_keeps_what_the_local_one_keeps_though_a_worker_is_killed(cluster, tmp_path):
     pytest.importorskip("torch", reason="training needs the extra `train`")
     from improvement_example import FakeTraining
     from improvement_example import run as improve
     from test_improvement_loop import results as outcome
 
-    walks = [write_walk(tmp_path / name, frames=30, seed=seed) for seed, name in enumerate(("kitchen", "hall"), 3)]
+    walks = [write_walk(tmp_path / name, frames=24, seed=seed) for seed, name in enumerate(("kitchen", "hall"), 3)]
     here = improve(tmp_path / "here", walks, FakeTraining(), rounds=1)
+    killer = Killer(tmp_path / "there")
+    killer.start()
     there = improve(tmp_path / "there", walks, FakeTraining(), rounds=1, ray="local", workers=2)
-    assert here.best == there.best
+    killer.join()
+    assert len(killer.killed) == 1
+    assert here.best == there.best == 1
     expected, found = outcome(tmp_path / "here"), outcome(tmp_path / "there")
     assert found.keys() == expected.keys()
+    assert len([name for name in found if name.endswith(".parquet")]) >= 9
     assert [name for name in found if found[name] != expected[name]] == []
 
 

@@ -9,9 +9,18 @@ import pyarrow.parquet as pq
 import pytest
 
 from improvo.errors import ConfigError, InputError, OutputError
+from improvo.folder_lock import claimed
 from improvo.labeling import frames as frames_module
 from improvo.labeling.frames import FramesTable, PackedImages, pack_images, read_frames, write_frames
-from improvo.labeling.store import DONE, FAILED, LabelStore, SequenceRecord, read_records, sequence_names
+from improvo.labeling.store import (
+    DONE,
+    FAILED,
+    LabelStore,
+    SequenceRecord,
+    lock_of,
+    read_records,
+    sequence_names,
+)
 
 SETTINGS = {"frontend": {"name": "orb", "max_keypoints": 500}, "seed": 0}
 
@@ -168,3 +177,16 @@ def test_a_manifest_that_cannot_be_written_is_no_failure_of_a_sequence(tmp_path,
     monkeypatch.setattr(store, "write_manifest", full)
     finish(store, "kitchen")
     assert is_done(store, "kitchen")
+
+
+def test_other_settings_may_follow_where_nothing_could_be_labelled(tmp_path: Path) -> None:
+    store = LabelStore(tmp_path / "labels", SETTINGS)
+    store.fail(SequenceRecord("kitchen", "/recordings/kitchen", FAILED, reason="a mask of another size"))
+    other = {**SETTINGS, "seed": 1}
+    with claimed(lock_of(store.folder, "kitchen"), store.folder), pytest.raises(ConfigError, match="was begun with"):
+        LabelStore(tmp_path / "labels", other)  # somebody is at work on it
+    again = LabelStore(tmp_path / "labels", other)
+    assert again.records() == []
+    finish(again, "kitchen")
+    with pytest.raises(ConfigError, match="was begun with"):
+        LabelStore(tmp_path / "labels", SETTINGS)

@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import datetime, timezone
 from pathlib import Path
 
 import cv2
@@ -25,9 +26,11 @@ from improvo.odometry.run import RunSummary
 from improvo.odometry.run_folder import RunFolder
 from improvo.odometry.scale.apply import apply_scale, segment_maps
 from improvo.odometry.scale.estimate import ScaleEstimate, from_measurements
+from improvo.odometry.scale.from_distance import scale_from_distance
 from improvo.odometry.scale.from_height import ground_plane
 from improvo.odometry.scale.settings import ScaleSettings, scale_settings
 from improvo.odometry.scale.sources import scale_source
+from improvo.odometry.scale.tracked import TrackedRun
 from improvo.sequences import Sequence, open_sequence
 from improvo.simulation.tum_writer import TumRgbdWriter
 from improvo.stability.tables import POINTS_FILE, read_points
@@ -114,7 +117,10 @@ def heights(sequence: Sequence) -> Float64:
 SOURCES: dict[str, tuple[Callable[[Sequence], ScaleSettings], float]] = {
     "depth": (lambda sequence: ScaleSettings("depth"), 0.03),
     "truth": (lambda sequence: ScaleSettings("truth"), 1e-6),
-    "distance": (lambda sequence: ScaleSettings("distance", distance_between(sequence, 3, 33), (3, 33)), 0.03),
+    "distance": (
+        lambda sequence: ScaleSettings("distance", distances=((3, 33, distance_between(sequence, 3, 33)),)),
+        0.03,
+    ),
     "height": (lambda sequence: ScaleSettings("height", float(np.median(heights(sequence)))), 0.05),
     "marker": (lambda sequence: ScaleSettings("marker", MARKER), 0.03),
 }
@@ -227,6 +233,54 @@ def test_contradictions_leave_the_run_as_it_is(
     assert before == {file.name: file.read_bytes() for file in run.folder.iterdir() if file.is_file()}
 
 
+def test_several_distances_are_averaged_and_contradictions_are_named(finished: tuple[Sequence, RunSummary]) -> None:
+    sequence, run = finished
+    tracked = TrackedRun(sequence, run)
+    pairs = ((3, 33), (0, 20), (15, 35))
+    true = [(a, b, distance_between(sequence, a, b)) for a, b in pairs]
+    several = scale_from_distance(tracked, ScaleSettings("distance", distances=tuple(true)))[0]
+    single = [scale_from_distance(tracked, ScaleSettings("distance", distances=(each,)))[0] for each in true]
+    factors = [each.metres_per_unit for each in single]
+    assert min(factors) <= several.metres_per_unit <= max(factors)
+    assert several.measurements == 3
+    assert several.relative_error is not None
+    assert several.relative_error < 0.02
+    wrong = (*true[:2], (15, 35, 1.5 * true[2][2]))
+    with pytest.raises(InputError, match=r"frames \d+ and \d+ give .* m a unit, frames 15 and 35 give .* apart"):
+        scale_from_distance(tracked, ScaleSettings("distance", distances=wrong))
+
+
+def write_gps(path: Path, sequence: Sequence, every: int, began: float) -> None:
+    """Places on the Earth of every so many frames' true poses, as GPX with dates."""
+    truth = sequence.ground_truth
+    assert truth is not None
+    east, up, north = (truth.camera_centers * (1, -1, 1)).T
+    rows = []
+    for row in range(0, len(truth), every):
+        when = datetime.fromtimestamp(began + float(sequence.times[row]), timezone.utc).isoformat()
+        latitude, longitude = north[row] / 111132.0, east[row] / 111319.5  # near the equator a degree is about as long
+        rows.append(
+            f'<trkpt lat="{latitude:.10f}" lon="{longitude:.10f}"><ele>{up[row]}</ele><time>{when}</time></trkpt>'
+        )
+    path.write_text(f'<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1">{"".join(rows)}</gpx>')
+
+
+def test_a_gps_track_on_its_own_clock_gives_the_size(finished: tuple[Sequence, RunSummary], tmp_path: Path) -> None:
+    sequence, run = finished
+    write_gps(tmp_path / "walk.gpx", sequence, every=4, began=1777629600.0)
+    settings = ScaleSettings("truth", reference=str(tmp_path / "walk.gpx"), began="2026-05-01T10:00:00Z")
+    ask = scale_source(sequence, settings)
+    assert ask is not None
+    scaled = apply_scale(sequence, run, ask, settings)
+    assert (
+        abs(error_of_size(scaled.trajectory, sequence.ground_truth)) < 0.01
+    )  # degrees of the sphere and the ellipsoid
+    assert scaled.report["metric"]["segments"][0]["measurements"] == 9
+    for began, what in ((None, r"it lasts from 2026-05-01T10:00:00Z"), ("noon", "noon is no time")):
+        with pytest.raises(InputError, match=what):
+            scale_source(sequence, replace(settings, began=began))
+
+
 def test_each_segment_is_scaled_about_where_it_began() -> None:
     poses = np.tile(np.eye(4), (7, 1, 1))
     poses[:, 0, 3] = [0, 1, 2, 2, 2.5, 3, np.nan]
@@ -268,12 +322,18 @@ def test_the_ground_is_the_lowest_plane_and_not_the_table() -> None:
 
 
 def test_settings_are_checked() -> None:
-    assert scale_settings(["truth", "a b.txt"]) == ["scale.source=truth", "scale.reference='a b.txt'"]
+    assert scale_settings([["truth", "a b.txt"]]) == ["scale.source=truth", "scale.reference='a b.txt'"]
+    distances = scale_settings([["distance", "1", "9", "2"], ["distance", "20", "30", "1.5"]])
+    assert distances == ["scale.source=distance", "scale.distances=[[1, 9, 2.0], [20, 30, 1.5]]"]
+    with pytest.raises(ConfigError, match="given twice"):
+        scale_settings([["height", "1"], ["depth"]])
     for wrong in (
         {"source": "inches"},
         {"source": "height"},
         {"source": "distance", "metres": 1.0},
-        {"source": "depth", "frames": (1, 2)},
+        {"source": "depth", "distances": ((1, 2, 3.0),)},
+        {"source": "distance", "distances": ((1, 2, -3.0),)},
+        {"source": "truth", "began": "12.5"},
         {"source": "marker", "metres": float("nan")},
     ):
         with pytest.raises(ConfigError):

@@ -85,6 +85,20 @@ def test_nerfstudio_scene_is_read_back_with_the_same_camera_and_poses(finished_r
     assert "property uchar red" in header
 
 
+def test_points_have_the_colours_of_the_map_also_without_images(finished_run: Path, tmp_path: Path) -> None:
+    assert main(["export", "colmap", str(finished_run), "-o", str(tmp_path / "scene"), "--no-images", "--quiet"]) == 0
+    lines = (tmp_path / "scene" / "sparse" / "0" / "points3D.txt").read_text().splitlines()[1:]
+    shades = np.array([[int(word) for word in line.split()[4:7]] for line in lines])
+    run = RunFolder(finished_run)
+    model = segment_model(run, 0)
+    assert run.map.rgb is not None
+    np.testing.assert_array_equal(shades, model.rgb)
+    known = (model.rgb != 128).any(axis=1)
+    assert known.mean() > 0.5
+    of_map = {tuple(row) for row in run.map.rgb.tolist()}
+    assert all(tuple(row) in of_map for row in model.rgb[known].tolist())
+
+
 def test_images_of_an_export_are_the_frames(finished_run: Path, tmp_path: Path) -> None:
     assert main(["export", "colmap", str(finished_run), "-o", str(tmp_path / "c")]) == 0
     picture = cv2.imread(str(tmp_path / "c" / "images" / "frame_000004.png"), cv2.IMREAD_GRAYSCALE)

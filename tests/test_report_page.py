@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from improvo.cli.main import main
+from improvo.files import write_png
 from improvo.report.charts import line_chart
 from improvo.report.improvement_page import Measure, Round, write_improvement_page
 from improvo.report.page import Page
@@ -124,6 +125,7 @@ def test_browser_loads_it_without_errors_and_slider_and_map_respond(page: Path, 
     until(lambda: scene.get_attribute("data-yaw") != yaw)
     browser.find_element("css selector", "input[name=layer][value=labels]").click()
     until(lambda: scene.get_attribute("data-layer") == "labels")
+    assert browser.find_element("id", "scene-labels").is_displayed()
     distance = scene.get_attribute("data-distance")
     scene.send_keys("+")
     until(lambda: float(scene.get_attribute("data-distance")) < float(distance))
@@ -140,6 +142,21 @@ def test_it_fits_a_phone(page: Path, browser: Any) -> None:
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     browser.get(page.as_uri())
     assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
+    # the picture from above has a form of its own, whose letters can be read
+    wide, shown = browser.execute_script(
+        "const p = document.querySelector('picture img'); return [p.src.length, p.currentSrc.length]"
+    )
+    assert shown != wide
+
+
+def test_dark_screens_print_on_white(page: Path, browser: Any) -> None:
+    dark = {"features": [{"name": "prefers-color-scheme", "value": "dark"}]}
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", dark)
+    browser.get(page.as_uri())
+    ink = "return getComputedStyle(document.body).color"
+    assert browser.execute_script(ink) == "rgb(232, 234, 237)"
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {**dark, "media": "print"})
+    assert browser.execute_script(ink) == "rgb(29, 33, 38)"
 
 
 def test_report_without_its_recording_says_so(finished_run: Path, tmp_path: Path) -> None:
@@ -264,7 +281,8 @@ def test_a_label_store_has_a_page_with_what_failed_and_why(finished_run: Path, t
     text = (labels / "report.html").read_text()
     assert "1 of 2" in text
     assert "still has no labels" in text
-    assert text.count("data:image/png") == 1
+    assert text.count("data:image/png") == 2  # the map from above, and the same for a telephone
+    assert "Withheld: it had a label" in text
     assert main(["report", str(labels / "walk"), "-o", str(tmp_path / "one.html")]) == 0
 
 
@@ -273,10 +291,13 @@ def test_improvement_is_told_with_its_setbacks(tmp_path: Path) -> None:
         Measure("success", "share of pairs", digits=2),
         Measure("error", "pixels", larger_is_better=False, digits=2),
     ]
+    picture = tmp_path / "matches.png"
+    write_png(picture, np.zeros((8, 8, 3), np.uint8))
+    drawn = ((picture, "matches of two frames"),)
     rounds = [
-        Round("before", {"success": 0.61, "error": 0.50}, {"stable": 1200}, {"label": 3.0}),
+        Round("before", {"success": 0.61, "error": 0.50}, {"stable": 1200}, {"label": 3.0}, drawn),
         Round("round 1", {"success": 0.70, "error": 0.47}, {"stable": 1500, "unstable": 90}),
-        Round("round 2", {"success": 0.74, "error": 0.58}),
+        Round("round 2", {"success": 0.74, "error": 0.58}, pictures=drawn),
     ]
     write_improvement_page(tmp_path / "page.html", "Improvement", "superpoint on <one> video", measures, rounds)
     text = (tmp_path / "page.html").read_text()
@@ -284,7 +305,12 @@ def test_improvement_is_told_with_its_setbacks(tmp_path: Path) -> None:
     assert "<b>0.74</b>" in text
     assert "<b>0.47</b>" in text
     assert "<b>0.58</b>" not in text
+    assert text.count("share of pairs") == 1
     assert "Worse than before: error, 0.50 → 0.58." in text
     assert "Worse than before: success" not in text
     assert text.count("<polyline") == 2
+    pair = text[text.index('<div class="pair">') :]
+    assert pair.index("before: matches") < pair.index("round 2: matches") < pair.index("</div>")
     assert "&lt;one&gt;" in text
+    write_improvement_page(tmp_path / "none.html", "Improvement", "", measures, rounds, best=0)
+    assert "round 2, not kept: matches" in (tmp_path / "none.html").read_text()

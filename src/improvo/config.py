@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
+import functools
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -118,7 +119,6 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings", bas
     Raises:
         ConfigError: an unknown key (with the nearest known one) or a value of the wrong type.
     """
-    import cattrs
     from cattrs.errors import ClassValidationError
 
     values = with_present_names(values, section_of(cls))
@@ -128,13 +128,8 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings", bas
     if base is not None:
         # a section given in part keeps what this class has for the rest of it, not the section's own defaults
         values = over(to_dict(base), values)
-    converter = cattrs.Converter(forbid_extra_keys=True)
-    converter.register_structure_hook(bool, _strict(bool))
-    converter.register_structure_hook(int, _strict(int))
-    converter.register_structure_hook(float, _strict(float))
-    converter.register_structure_hook(str, _strict(str))
     try:
-        return converter.structure(values, cls)
+        return _converter().structure(values, cls)
     except ClassValidationError as error:
         raise ConfigError(f"{where}: {_first_reason(error)}") from None
     except (TypeError, ValueError, OverflowError, AttributeError, LookupError) as error:
@@ -176,6 +171,17 @@ def over(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
         below = result.get(key)
         result[key] = over(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
     return result
+
+
+@functools.cache
+def _converter() -> Any:
+    """Takes values of the right type alone; it writes code for each class once, which takes longer than using it."""
+    import cattrs
+
+    converter = cattrs.Converter(forbid_extra_keys=True)
+    for kind in (bool, int, float, str):
+        converter.register_structure_hook(kind, _strict(kind))
+    return converter
 
 
 def _has_default(field: dataclasses.Field[Any]) -> bool:

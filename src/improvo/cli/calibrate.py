@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from improvo.cli.flags import add_setting
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import figures, next_step, notice, say
 from improvo.errors import ConfigError, InputError
 from improvo.self_calibration.settings import SelfCalibrationSettings
@@ -29,7 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `improvo calibrate`."""
     defaults = SelfCalibrationSettings()
     parser.add_argument(
-        "recording", nargs="?", type=Path, metavar="RECORDING", help="a video, an image folder or a data set"
+        "recording",
+        nargs="?",
+        type=recording_path,
+        metavar="RECORDING",
+        help="a video, an image folder, a data set, or `demo`",
     )
     parser.add_argument(
         "--from",

@@ -1,7 +1,8 @@
 """A trajectory against the truth (Zhang and Scaramuzza 2018): absolute error, relative errors over sub-trajectories.
 
-ESTIMATE is a TUM, KITTI or EuRoC file, or the output folder of `improvo run`; TRUTH such a file, or a sequence that has
-true poses or gets them by --truth. Segments of an estimate (`# segment N` lines) are aligned each on its own.
+ESTIMATE is a TUM, KITTI or EuRoC file, or the output folder of `improvo run`; TRUTH is such a file or folder, or a
+sequence that has true poses or gets them by --truth. Segments of an estimate (`# segment N` lines) are aligned each on
+its own.
 """
 
 from __future__ import annotations
@@ -10,13 +11,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import figures, next_after_figures
 from improvo.errors import InputError
 from improvo.evaluation.settings import ALIGNMENTS, TrajectoryCommandSettings, TrajectorySettings
 from improvo.sequences.base import SequenceSettings
 
 if TYPE_CHECKING:
+    from improvo.odometry.run_folder import RunFolder
     from improvo.types import Trajectory
 
 COMMAND = "evaluate trajectory"
@@ -32,7 +34,7 @@ TRAJECTORY_FLAGS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `improvo evaluate trajectory`."""
     parser.add_argument("estimate", type=Path, metavar="ESTIMATE")
-    parser.add_argument("against", type=Path, metavar="TRUTH")
+    parser.add_argument("against", type=recording_path, metavar="TRUTH")
     parser.add_argument(
         "--truth",
         metavar="FILE",
@@ -112,24 +114,23 @@ def read_pair(
 
     Args:
         estimate_path: a trajectory file, or the folder of a run.
-        truth_path: a trajectory file, or a sequence.
+        truth_path: a trajectory file, the folder of a run, or a sequence.
         sequence: how the sequence is read.
         reference: true poses that replace those of the sequence.
 
     Raises:
-        InputError: a file that is no trajectory, a folder without one, a sequence without true poses, or KITTI rows
-            without times of which the other has another number.
+        InputError: a file that is no trajectory, a folder without one, a sequence without true poses, a run without
+            poses or with several segments as the truth, or KITTI rows without times of which the other has another
+            number.
     """
     from improvo.evaluation.truth.reference import lacks_times
     from improvo.evaluation.truth.referenced import open_with_truth
     from improvo.geometry.trajectory_files import has_times, read_trajectory_report
-    from improvo.odometry.run_folder import RunFolder, why_no_pose
+    from improvo.odometry.run_folder import RunFolder
     from improvo.sequences.opening import true_trajectory
 
     if (estimate_path / "run.json").is_file():
-        without = why_no_pose(RunFolder(estimate_path).report)
-        if without is not None:
-            raise InputError(f"{estimate_path}: {without}")
+        _refuse_without_pose(RunFolder(estimate_path))
     estimate_path = estimate_path / "trajectory.txt" if estimate_path.is_dir() else estimate_path
     if not estimate_path.exists():
         raise InputError(f"{estimate_path}: no such file; give a trajectory file or the output folder of `improvo run`")
@@ -140,6 +141,8 @@ def read_pair(
         assert truth is not None
     elif lacks_times(truth_path):
         raise InputError(f"{truth_path}: has no times; give the sequence as TRUTH, and this with --truth")
+    elif (truth_path / "run.json").is_file():
+        truth, truth_notes = _of_run(truth_path)
     elif truth_path.is_dir():
         truth, truth_notes = true_trajectory(truth_path, sequence), ()
         if truth is None:
@@ -160,6 +163,28 @@ def read_pair(
                 "TUM file"
             )
     return estimate, truth, (*estimate_notes, *truth_notes)
+
+
+def _refuse_without_pose(run: RunFolder) -> None:
+    from improvo.odometry.run_folder import why_no_pose
+
+    without = why_no_pose(run.report)
+    if without is not None:
+        raise InputError(f"{run.path}: {without}")
+
+
+def _of_run(folder: Path) -> tuple[Trajectory, tuple[str, ...]]:
+    """The trajectory of a run that another is held against, and a note on its unit."""
+    from improvo.odometry.run_folder import RunFolder
+
+    run = RunFolder(folder)
+    _refuse_without_pose(run)
+    segments = len(run.report["segments"])
+    if segments > 1:
+        raise InputError(
+            f"{folder}: its trajectory has {segments} segments, each in a world of its own; a truth needs one"
+        )
+    return run.trajectory, (f"{folder}: is a run, no ground truth; lengths are {run.unit}",)
 
 
 def _at_rows_of(counted: Trajectory, timed: Trajectory, path: Path, other: Path) -> tuple[Trajectory, str]:

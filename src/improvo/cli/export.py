@@ -42,9 +42,10 @@ def run_colmap(arguments: argparse.Namespace) -> None:
         target = arguments.output / "sparse" / str(number)
         write_colmap(model, run_folder.camera, target, colours)
         say(
-            f"{target}: {len(model.frames)} images, {len(model.xyz)} points, {len(model.error)} observations, "
+            f"{target}: {len(model.frames)} images, {_points(model)}, {len(model.error)} observations, "
             f"mean re-projection error {model.mean_error:.6f} px"
         )
+    say(f"  the map of the run joins tracks of the same place to {len(run_folder.map)} points")
     next_step(f"open {arguments.output / 'sparse' / '0'} with COLMAP, pycolmap or what reads their model")
 
 
@@ -66,7 +67,7 @@ def run_nerfstudio(arguments: argparse.Namespace) -> None:
     make_output_folder(arguments.output, "export nerfstudio")
     colours = _write_images(run_folder, model, arguments.output / "images")
     write_nerfstudio(model, run_folder.camera, arguments.output, colours)
-    say(f"{arguments.output / 'transforms.json'}: {len(model.frames)} images, {len(model.xyz)} points")
+    say(f"{arguments.output / 'transforms.json'}: {len(model.frames)} images, {_points(model)}")
     if len(segments) > 1:
         left = run_folder.frames - len(model.frames)
         say(f"  only the longest of {len(segments)} segments: {left} frames have no pose in its world")
@@ -124,6 +125,11 @@ def run_onnx(arguments: argparse.Namespace) -> None:
     say("without the move to the image's corners (`improvo.frontend.corners`), which `improvo run` makes afterwards")
     reader = f"cv2.ALIKED.create('{arguments.output}', parameters)" if for_opencv else ""
     next_step(f"`{reader}` in OpenCV 5" if reader else "load it with ONNX Runtime or any other runtime")
+
+
+def _points(model: Model) -> str:
+    """How many points there are, and of what."""
+    return f"{len(model.xyz)} points (one for each good track)"
 
 
 def _add_model_arguments(parser: argparse.ArgumentParser, contents: str) -> None:

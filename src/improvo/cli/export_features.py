@@ -7,6 +7,7 @@ verified two-view geometries. Both have the frames, undistorted as the features 
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 
 from improvo.cli.flags import add_setting
@@ -17,7 +18,7 @@ from improvo.cli.options import (
     recording_path,
     settings_from,
 )
-from improvo.cli.output import next_step, say
+from improvo.cli.output import figures, next_step
 from improvo.export.settings import FeatureExportSettings
 
 _LAYOUTS = ("hloc", "colmap")
@@ -69,9 +70,10 @@ def run(arguments: argparse.Namespace) -> int:
             written = write_hloc(frames, sequence.camera, folder, settings.descriptors)
         else:
             written = write_colmap_database(frames, sequence.camera, folder, settings.seed)
-    say(
+    figures(
+        {"folder": str(folder), "layout": arguments.layout, **asdict(written)},
         f"{folder}: {written.images} images, {written.keypoints} keypoints, {written.pairs} "
-        f"{'pairs' if for_hloc else 'verified pairs'}, {written.matches} matches"
+        f"{'pairs' if for_hloc else 'verified pairs'}, {written.matches} matches",
     )
     if for_hloc:
         camera = sequence.camera

@@ -9,7 +9,13 @@ from typing import Any
 
 from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.flags import add_setting
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
+from improvo.cli.options import (
+    add_config_arguments,
+    add_sequence_arguments,
+    recording_path,
+    recording_words,
+    settings_from,
+)
 from improvo.cli.output import figures, next_step, say
 from improvo.sequences.settings import InfoSettings
 
@@ -53,7 +59,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.write_mask is not None:
         say(_write_mask(arguments, settings))
         options += f" --mask {arguments.write_mask}"
-    next_step(f"`improvo run {arguments.sequence}{options} -o out`")
+    next_step(f"`improvo run {recording_words(arguments.sequence)}{options} -o out`")
 
 
 def _write_mask(arguments: argparse.Namespace, settings: InfoSettings) -> str:

@@ -18,6 +18,7 @@ from improvo.cli.options import (
     add_sequence_arguments,
     folder_path,
     recording_path,
+    recording_words,
     settings_from,
 )
 from improvo.cli.output import figures, next_step, notice, say
@@ -61,8 +62,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scale",
         nargs="+",
+        action="append",
         metavar="FROM",
-        help=f"results in metres: {USAGE} (default: up to scale)",
+        help=f"results in metres: {USAGE}; several distances by several --scale (default: up to scale)",
     )
     add_sequence_arguments(parser)
     add_config_arguments(parser)
@@ -121,7 +123,7 @@ def _tracked(arguments: argparse.Namespace, sequence: Sequence, settings: DenseR
             f"`improvo report {summary.folder}` makes a page of it, `improvo show map {summary.folder}` a picture"
         )
     else:
-        next_step(f"`improvo info {arguments.sequence}` looks for what is wrong with the recording")
+        next_step(f"`improvo info {recording_words(arguments.sequence)}` looks for what is wrong with the recording")
     if interrupted:
         return 130
     return 0 if summary.tracked else NO_RESULT

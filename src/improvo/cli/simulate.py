@@ -9,7 +9,7 @@ from typing import Any
 
 from improvo.cli.flags import add_setting
 from improvo.cli.options import add_config_arguments, settings_from
-from improvo.cli.output import next_step, say
+from improvo.cli.output import figures, next_step
 from improvo.simulation.settings import SimulationSettings
 
 
@@ -39,17 +39,24 @@ def run(arguments: argparse.Namespace) -> None:
     settings = _settings(arguments)
     check_output_folder(arguments.output, "simulate")
     common: dict[str, Any] = {"jpeg_quality": arguments.jpeg, "depth_every": arguments.depth_every}
+    measures = {name: getattr(settings, name) for name in ("frames", "width", "height", "fps", "fov", "seed")}
     if arguments.scenes == 1:
         with progress("simulate", "frame", settings.frames) as shown:
             simulate(settings, arguments.output, **common, progress=shown.advance)
-        say(f"{arguments.output}: {settings.frames} frames of {settings.width}x{settings.height}, seed {settings.seed}")
+        figures(
+            {"folders": [str(arguments.output)], **measures},
+            f"{arguments.output}: {settings.frames} frames of {settings.width}x{settings.height}, seed {settings.seed}",
+        )
         next_step(f"`improvo run {arguments.output} -o out`, `improvo evaluate trajectory out {arguments.output}`")
         return
     with progress("simulate", "scene", arguments.scenes) as shown:
         folders = simulate_many(
             settings, arguments.output, arguments.scenes, arguments.workers, **common, progress=shown.advance
         )
-    say(f"{arguments.output}: {len(folders)} recordings, {folders[0].name} to {folders[-1].name}")
+    figures(
+        {"folders": [str(folder) for folder in folders], **measures},
+        f"{arguments.output}: {len(folders)} recordings, {folders[0].name} to {folders[-1].name}",
+    )
     next_step(f"`improvo label {arguments.output}/* -o labels`")
 
 

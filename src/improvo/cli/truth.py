@@ -13,7 +13,13 @@ from pathlib import Path
 from improvo import terminal
 from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.evaluate_options import available_cores
-from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
+from improvo.cli.options import (
+    add_config_arguments,
+    add_sequence_arguments,
+    recording_path,
+    recording_words,
+    settings_from,
+)
 from improvo.cli.output import figures, next_step
 from improvo.evaluation.truth.settings import CALIBRATE, TruthCommandSettings, TruthSettings
 
@@ -68,5 +74,5 @@ def run(arguments: argparse.Namespace) -> int:
             progress=told,
         )
     figures(asdict(quality), f"{arguments.output}: {quality.text()}")
-    next_step(f"`improvo evaluate trajectory OUT {arguments.sequence} --truth {arguments.output}`")
+    next_step(f"`improvo evaluate trajectory OUT {recording_words(arguments.sequence)} --truth {arguments.output}`")
     return 0

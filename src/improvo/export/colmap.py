@@ -23,7 +23,7 @@ def write_colmap(model: Model, camera: Camera, folder: Path, colours: UInt8 | No
         model: the segment.
         camera: pinhole.
         folder: made if need be.
-        colours: (P, 3) RGB of the points.
+        colours: (P, 3) RGB of the points; by default those of the map.
     """
     write_text(folder / "cameras.txt", _camera(camera))
     order = np.lexsort((model.point, model.frame))  # observations by image; the place in the image is POINT2D_IDX
@@ -57,7 +57,7 @@ def _images(model: Model, order: np.ndarray, bounds: np.ndarray) -> str:
 def _points(model: Model, place: np.ndarray, colours: UInt8 | None) -> str:
     lines = ["# POINT3D_ID X Y Z R G B ERROR, then IMAGE_ID POINT2D_IDX of each observation\n"]
     errors = model.point_errors().tolist()
-    shades = (np.full((len(model.xyz), 3), 128) if colours is None else colours).tolist()
+    shades = (model.rgb if colours is None else colours).tolist()
     bounds = np.searchsorted(model.point, np.arange(len(model.xyz) + 1))
     for number, xyz in enumerate(model.xyz.tolist()):
         rows = slice(bounds[number], bounds[number + 1])

@@ -11,6 +11,7 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.files import write_png
 from improvo.geometry import se3
+from improvo.odometry.point_colours import UNKNOWN
 from improvo.odometry.run_folder import RunFolder
 from improvo.types import Float64, Int64, UInt8
 
@@ -23,6 +24,7 @@ class Model:
     cam_from_world: Float64  # (F, 4, 4)
     xyz: Float64  # (P, 3)
     stability: Int64  # (P,) label codes
+    rgb: UInt8  # (P, 3) of the map point that the track belongs to; grey where it belongs to none
     frame: Int64  # (M,) row of `frames`, sorted by point, then frame
     point: Int64  # (M,) row of `xyz`
     keypoints: Float64  # (M, 2) pixels, the centre of the top-left pixel at (0, 0)
@@ -73,11 +75,17 @@ def segment_model(run: RunFolder, segment: int, max_error: float = 4.0, min_obse
     enough = np.bincount(point[good], minlength=len(xyz)) >= min_observations
     good &= enough[point]
     new_row = np.cumsum(enough) - 1
+    rgb = np.full((len(xyz), 3), UNKNOWN, np.uint8)
+    of_map = run.points.point[usable]
+    if run.map.rgb is not None:
+        in_map = (of_map >= 0) & (of_map < len(run.map))
+        rgb[in_map] = run.map.rgb[of_map[in_map]]
     return Model(
         frames,
         cam_from_world,
         xyz[enough],
         run.points.stability[usable][enough].astype(np.int64),
+        rgb[enough],
         frame[good],
         new_row[point[good]],
         keypoints[good],
@@ -111,7 +119,7 @@ def write_images(run: RunFolder, model: Model, folder: Path, advance: Callable[[
         folder: made if need be.
         advance: is called after every frame.
     """
-    colours = np.full((len(model.xyz), 3), 128, np.uint8)
+    colours = model.rgb.copy()
     first = np.flatnonzero(np.diff(model.point, prepend=-1))
     pixels = np.rint(model.keypoints[first]).astype(np.int64)
     for row, frame in enumerate(model.frames.tolist()):

@@ -10,10 +10,10 @@ import os
 import socket
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
-from improvo.errors import InputError, MissingExtraError
+from improvo.errors import InputError, imported
 from improvo.jobs.processes import Job, Result, Tick
 from improvo.jobs.workers import ONE_THREAD, POLL_SECONDS, WorkerDiedError, with_errors_sent
 
@@ -55,7 +55,7 @@ def run_on_ray(
         resources = ray.cluster_resources()
         if resources.get("GPU", 0) < gpus:
             raise InputError(f"the Ray cluster at {address} has no node with a GPU; ask for the CPU instead")
-        counter = ray.remote(num_cpus=0)(_Counter).remote()
+        counter = ray.remote(num_cpus=0, max_restarts=3)(_Counter).remote()
         task = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=0)(_work)
         most = workers or _WAITING_PER_CORE * max(int(resources.get("CPU", 1)), 1)
         waiting, told = deque(jobs), 0
@@ -90,15 +90,11 @@ def gpus_of(address: str) -> int:
 
 
 def _imported() -> Any:
-    try:
-        import ray
-    except ImportError:
-        raise MissingExtraError("work on a Ray cluster", "ray") from None
-    return ray
+    return imported("ray", "work on a Ray cluster", "ray")
 
 
 class _Counter:
-    """An actor: how often all jobs ticked."""
+    """An actor: how often all jobs ticked. Where its node dies, it begins anew on another."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -136,7 +132,8 @@ def _work(work: Callable[[Job, Tick], Result], job: Job, counter: Any, folder: s
     finally:
         import ray
 
-        ray.get(counter.add.remote(untold))
+        with suppress(ray.exceptions.RayError):  # the counter's node died: progress is not worth a job
+            ray.get(counter.add.remote(untold))
 
 
 def _result(ray: Any, reference: Any) -> Any:
@@ -152,12 +149,14 @@ def _result(ray: Any, reference: Any) -> Any:
 
 
 def _tell(ray: Any, counter: Any, told: int, on_ticks: Callable[[int], None]) -> int:
+    """Tell what has come since `told` ticks; returns how many have come."""
     try:
         count: int = ray.get(counter.count.remote())
-    except ray.exceptions.RayError:  # its node died: there is no progress to show, the jobs are what counts
+    except ray.exceptions.RayError:  # its node died, and another does not have it yet
         return told
-    if count > told:
-        on_ticks(count - told)
+    new = count - told if count >= told else count  # it began anew elsewhere
+    if new:
+        on_ticks(new)
     return count
 
 

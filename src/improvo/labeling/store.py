@@ -37,7 +37,7 @@ from improvo.files import (
     written_atomically,
 )
 from improvo.folder_lock import LOCK, BusyError, holder_of, locked, seems_held
-from improvo.locations import publish, removed
+from improvo.locations import lock_files, publish, removed
 from improvo.untrusted.text import read_json_file
 
 MANIFEST_FILE, SETTINGS_FILE, RECORD_FILE = "manifest.parquet", "settings.yaml", "label.json"
@@ -96,6 +96,7 @@ class LabelStore:
         self.folder = folder
         self._refreshed, self._refresh_seconds = 0.0, 0.0
         made_with = SettingsRecord(folder / SETTINGS_FILE, kind)
+        relabel = relabel or self._holds_only_failures()  # a wrong mask, say: nothing is lost by other settings
         if not relabel:
             made_with.check(settings, _OTHER_SETTINGS)
         if not made_with.path.is_file():
@@ -108,6 +109,12 @@ class LabelStore:
             make_output_folder(folder, _COMMAND)
             self._clear_partials()
             made_with.write(settings)
+
+    def _holds_only_failures(self) -> bool:
+        """Whether something was tried here, nothing is done, and nobody is at work."""
+        records = self.records() if self.folder.is_dir() else []
+        held = any(seems_held(lock) for lock in self.folder.glob(".*.lock") if lock.name != LOCK)
+        return bool(records) and not held and all(record.state != DONE for record in records)
 
     def _clear_partials(self) -> None:
         """Remove what nobody works on any more."""
@@ -124,7 +131,7 @@ class LabelStore:
         Raises:
             BusyError: another command labels here.
         """
-        for lock in self.folder.glob(".*.lock"):
+        for lock in {*self.folder.glob(".*.lock"), *lock_files(self.folder)}:
             if lock.name != LOCK and seems_held(lock):
                 raise BusyError(self.folder, holder_of(lock) or "another process")
         for record in self.records():

@@ -80,6 +80,7 @@ def run_odometry(
         sequence: the frames.
         folder: made if need be; must be empty or one that `command` made.
         settings: all of them; `settings.sequence` is only recorded.
+        command: that the folder belongs to.
         frontend: in place of the one that the settings name.
         visualizer: is shown every frame.
         progress: is called after every frame.

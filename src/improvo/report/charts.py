@@ -8,7 +8,8 @@ import numpy as np
 
 from improvo.types import Float64
 
-_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 900, 190, 52, 40, 22
+# room for letters of 22 px, which a telephone shows at this width (page.css)
+_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 900, 206, 72, 52, 28
 
 
 def line_chart(x: Float64, y: Float64, label: str, most: float | None = None, across_of: str = "frame") -> str:
@@ -37,10 +38,10 @@ def line_chart(x: Float64, y: Float64, label: str, most: float | None = None, ac
     for value in columns:
         column = (value - left) / max(right - left, 1e-12) * (_WIDTH - _LEFT - 8) + _LEFT
         anchor = "end" if value == columns[-1] and len(columns) > 1 else "middle"  # the last one ends with the line
-        parts.append(f'<text x="{column:.1f}" y="{_HEIGHT - 23}" text-anchor="{anchor}">{value:.0f}</text>')
+        parts.append(f'<text x="{column:.1f}" y="{_HEIGHT - 30}" text-anchor="{anchor}">{value:.0f}</text>')
     middle = (_WIDTH + _LEFT) / 2
     parts.append(f'<text x="{middle:.0f}" y="{_HEIGHT - 6}" text-anchor="middle">{escape(across_of)}</text>')
-    parts.append(f'<text x="0" y="12">{escape(label)}</text>')
+    parts.append(f'<text x="2" y="18">{escape(label)}</text>')
     breaks = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
     for first, end in zip(breaks[::2], breaks[1::2], strict=True):
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across[first:end], up[first:end], strict=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 
 from improvo.report.charts import line_chart
 from improvo.report.page import Page, plain
+from improvo.report.plain_words import LABEL_WORDS
 
 
 @dataclass(frozen=True)
@@ -74,19 +76,25 @@ def write_improvement_page(
     page.warnings([*notes, *_setbacks(measures, first, last)], "Nothing: every measure is at least as good as before.")
     if len(gains) > 1:
         page.heading("Gain over the start")
-        page.table(list(gains[0]), [list(row) for row in gains[1:]], "With 95 % intervals over the same pairs.")
+        page.table(list(gains[0]), [list(row) for row in gains[1:]], "In brackets 95 % intervals over the same pairs.")
     page.heading("Before and after")
     page.table(
         ["", *(entry.name for entry in rounds)],
         [[measure.name, *_cells(measure, rounds)] for measure in measures],
         "The best of each row is bold.",
     )
-    for measure in measures:
-        page.paragraph(f"{measure.name}: {measure.meaning}", note=True)
+    page.details("What the rows mean", _meanings(measures))
+    # where nothing was kept, the last try is held against the start
+    tried = [entry for entry in rounds[1:] if not entry.aside]
+    after, kept = (last, "") if last is not first else (tried[-1] if tried else None, ", not kept")
     for place in range(max(len(entry.pictures) for entry in rounds)):
-        for entry in (first, last) if last is not first else (first,):
-            for picture, caption in entry.pictures[place : place + 1]:
-                page.picture(picture, f"{entry.name}: {caption}")
+        shown = [
+            (picture, f"{entry.name}{kept if entry is after else ''}: {caption}")
+            for entry in (first, after)
+            if entry is not None
+            for picture, caption in entry.pictures[place : place + 1]
+        ]
+        page.side_by_side(shown)
     in_order = [entry for entry in rounds if not entry.aside]
     if len(in_order) > 2:
         _curves(page, measures, in_order)
@@ -95,7 +103,7 @@ def write_improvement_page(
     page.table(
         ["made with", *names],
         [[entry.name, *(f"{entry.labels.get(name, 0):,}" for name in names)] for entry in rounds if entry.labels],
-        "Tracks by label; more and longer tracks teach more.",
+        "Tracks by label; more and longer tracks teach more. " + LABEL_WORDS,
     )
     page.heading("Time")
     for entry in rounds:
@@ -125,11 +133,20 @@ def _setbacks(measures: Sequence[Measure], first: Round, last: Round) -> list[st
     return lines
 
 
+def _meanings(measures: Sequence[Measure]) -> str:
+    """What each measure is, those with the same meaning together."""
+    names: dict[str, list[str]] = {}
+    for measure in measures:
+        names.setdefault(measure.meaning, []).append(measure.name)
+    lines = [textwrap.fill(f"{'; '.join(name)}: {meaning}", 100) for meaning, name in names.items()]
+    return "\n\n".join(lines)
+
+
 def _cells(measure: Measure, rounds: Sequence[Round]) -> list[str]:
     values = [entry.values.get(measure.name) for entry in rounds]
     cells = ["-" if value is None else f"{value:.{measure.digits}f}" for value in values]
     known = [value for value in values if value is not None]
-    if not known:
+    if len(set(cells)) < 2:  # nothing to choose from
         return cells
     best = (max if measure.larger_is_better else min)(known)
     printed = f"{best:.{measure.digits}f}"

@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from improvo.errors import PLOTS_MISSING, plots_installed
 from improvo.labeling.store import DONE, read_records
 from improvo.odometry.run_folder import RunFolder
 from improvo.report.map_picture import map_png
 from improvo.report.page import Page, plain
 from improvo.report.palettes import PALETTES, Palette
-from improvo.report.plain_words import warnings
+from improvo.report.plain_words import LABEL_WORDS, warnings
+from improvo.terminal import counted
 
 _MAX_MAPS = 12
 _MAX_NAMES = 3  # of recordings, in the title
@@ -34,13 +36,13 @@ def write_label_page(folder: Path, path: Path, palette: Palette = PALETTES["pape
     totals = {name: sum(int(row[name]) for row in rows) for name in ("stable", "unstable", "ignore", "withheld")}
     page = Page(
         f"Labels of {_named([str(row['name']) for row in rows])}",
-        f"{len(rows)} sequences, labelled by `improvo label`.",
+        f"{counted(len(rows), 'sequence')}, labelled by `improvo label`.",
     )
     page.tiles(
         [
             (f"{len(runs)} of {len(rows)}", "sequences with labels"),
             (f"{sum(int(row['tracked']) for row in rows):,}", "frames with a pose"),
-            *((f"{count:,}", f"{name} tracks") for name, count in totals.items()),
+            *((f"{count:,}", f"tracks: {name}") for name, count in totals.items()),
         ]
     )
     failed = [f"{row['name']} has no labels: {row['reason']}." for row in rows if row["state"] != DONE]
@@ -48,9 +50,7 @@ def write_label_page(folder: Path, path: Path, palette: Palette = PALETTES["pape
     page.heading("Sequences")
     page.table(_COLUMNS, [[_words(row[name]) for name in _COLUMNS] for row in rows])
     page.paragraph(
-        "Withheld: tracks whose label the quality gate took away, because the odometry is not to be trusted where "
-        "they were seen.",
-        note=True,
+        "Columns of tracks: stable ones fit the camera's motion, unstable ones contradict it. " + LABEL_WORDS, note=True
     )
     for run in runs[:_MAX_MAPS]:
         page.html(f"<h3>{plain(run.name)}</h3>")
@@ -58,8 +58,10 @@ def write_label_page(folder: Path, path: Path, palette: Palette = PALETTES["pape
             warnings(run.report, np.zeros(0, np.int64), np.zeros(0), float("nan")),
             "Every frame has a pose, in one segment.",
         )
-        if len(run.trajectory):
-            page.picture(map_png(run, palette), f"{run.name} from above")
+        if len(run.trajectory) and not plots_installed():
+            page.paragraph(f"Its map, seen from above: {PLOTS_MISSING}.", note=True)
+        elif len(run.trajectory):
+            page.picture(map_png(run, palette), f"{run.name} from above", map_png(run, palette, narrow=True))
     page.write(path)
 
 

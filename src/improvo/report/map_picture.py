@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from improvo.errors import InputError
+from improvo.errors import InputError, require_plots
 from improvo.files import written_atomically
 from improvo.odometry.run_folder import RunFolder
 from improvo.report.overhead import overhead_axes, robust_limits
@@ -19,6 +20,7 @@ from improvo.types import SparseMap, UInt8
 _BACKGROUND = "#565b63"  # neither the paper's black (last window) nor its white (points)
 _DOUBTED = "#ff4fd8"  # a band under the path, which no ramp of the palettes has
 LAST_POSES = 30  # N_last
+_NARROW, _NARROW_LINE = 3.8, 60  # inches, and letters of the title in a line, on a telephone
 _DARKEST = 70  # grey level in which black points are drawn
 
 
@@ -28,18 +30,29 @@ def draw_map(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"], l
     Raises:
         InputError: no frame of the run has a pose.
         OutputError: the file cannot be written.
+        MissingExtraError: matplotlib is not installed.
     """
     picture = map_png(run, palette, last_poses)
     with written_atomically(path) as temporary:
         temporary.write_bytes(picture)
 
 
-def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: int = LAST_POSES) -> bytes:
+def map_png(
+    run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: int = LAST_POSES, narrow: bool = False
+) -> bytes:
     """A PNG: points in their own colours, the trajectory from blue to red over time, the last window black.
+
+    Args:
+        run: the finished run.
+        palette: of the trajectory.
+        last_poses: that are drawn black.
+        narrow: for a telephone: as wide as its screen in inches, so that letters have the size that they are given.
 
     Raises:
         InputError: no frame of the run has a pose.
+        MissingExtraError: matplotlib is not installed.
     """
+    require_plots("a map seen from above")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
@@ -53,12 +66,15 @@ def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: in
     points_2d = axes_of_world.project(run.map.xyz[shown])
     low, high = robust_limits(path_2d, points_2d)
     width, height = _figure_size(high - low)
+    if narrow:
+        width, height = _NARROW, height * _NARROW / width + 0.6
     figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     axis = figure.subplots()
     axis.set_facecolor(_BACKGROUND)
     inside = ((points_2d > low) & (points_2d < high)).all(axis=1)
     size, alpha = _point_style(int(inside.sum()))
+    size *= 0.4 if narrow else 1.0
     axis.scatter(
         points_2d[inside, 0],
         points_2d[inside, 1],
@@ -116,10 +132,13 @@ def map_png(run: RunFolder, palette: Palette = PALETTES["paper"], last_poses: in
     unit = "metres" if run.unit.startswith("metres") else "map units: the first median depth is 1"
     axis.set_xlabel(f"right of the first camera ({unit})", fontsize=8)
     axis.set_ylabel("ahead of the first camera", fontsize=8)
-    axis.set_title(_title(run, len(shown), int((~inside).sum()), truth), fontsize=10)
+    title = _title(run, len(shown), int((~inside).sum()), truth)
+    if narrow:
+        title = "\n".join(textwrap.fill(line, _NARROW_LINE) for line in title.splitlines())
+    figure.suptitle(title, fontsize=8 if narrow else 10)
     _time_bar(figure, axis, palette, run.frames, len(last))
     png = io.BytesIO()
-    figure.savefig(png, dpi=150, format="png", bbox_inches="tight", metadata={"Software": None})
+    figure.savefig(png, dpi=220 if narrow else 150, format="png", bbox_inches="tight", metadata={"Software": None})
     return png.getvalue()
 
 
@@ -168,9 +187,10 @@ def _point_style(count: int) -> tuple[float, float]:
 def _time_bar(figure: object, axis: object, palette: Palette, frames: int, last: int) -> None:
     """The colour bar."""
     from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
+    from matplotlib.colors import ListedColormap, Normalize
 
-    scale = ScalarMappable(Normalize(0, max(frames - 1, 1)), palette.colormap())
+    colours = ListedColormap(list(palette.ramp_table() / 255.0))
+    scale = ScalarMappable(Normalize(0, max(frames - 1, 1)), colours)
     bar = figure.colorbar(scale, ax=axis, fraction=0.035, pad=0.02)  # type: ignore[attr-defined]
     bar.set_label(f"frame (black: the last {last})", fontsize=8)
     bar.ax.tick_params(labelsize=8)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -15,6 +15,9 @@ from improvo.files import write_text
 
 # an absolute path of this machine, of Unix or Windows; what is behind a letter, as in a/b or https://a/b, is none
 _ABSOLUTE = re.compile(r"(?<![\w./:])(?:/(?:[^/\s\"'`<>|]+/)+|[A-Za-z]:\\(?:[^\\\s\"'`<>|]+\\)+)(?=[^/\s])")
+
+
+_WIDE = 2.0  # width over height of pictures that would be too small beside each other
 
 
 def plain(text: str) -> str:
@@ -72,11 +75,14 @@ class Page:
             f"{below}</figure>"
         )
 
-    def bars(self, header: Sequence[str], rows: Sequence[tuple[str, float, str]]) -> None:
-        """A table of (name, value, value in words) with a bar for each value."""
+    def bars(
+        self, header: Sequence[str], rows: Sequence[tuple[str, float, str]], colours: Mapping[str, str] | None = None
+    ) -> None:
+        """A table of (name, value, value in words) with a bar for each value; `colours` (CSS) of names are a legend."""
+        colours = colours or {}
         largest = max((value for _, value, _ in rows), default=0.0) or 1.0
         body = "".join(
-            f'<tr><td>{plain(name)}</td><td>{plain(words)}</td><td class="bar">'
+            f'<tr><td>{_swatch(colours.get(name))}{plain(name)}</td><td>{plain(words)}</td><td class="bar">'
             f'<i style="width:{100 * value / largest:.1f}%"></i></td></tr>'
             for name, value, words in rows
         )
@@ -104,14 +110,15 @@ class Page:
             if rows:
                 self.table(rows[0], rows[1:])
 
-    def picture(self, content: bytes | Path, caption: str) -> None:
-        """A PNG or JPEG, embedded."""
-        content = content.read_bytes() if isinstance(content, Path) else content
-        kind = "png" if content.startswith(b"\x89PNG") else "jpeg"
-        source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
-        self._body.append(
-            f'<figure><img src="{source}" alt="{plain(caption)}"><figcaption>{plain(caption)}</figcaption></figure>'
-        )
+    def picture(self, content: bytes | Path, caption: str, narrow: bytes | None = None) -> None:
+        """A PNG or JPEG, embedded; `narrow` is the same for telephones, with larger letters."""
+        self._body.append(_figure(content, caption, narrow))
+
+    def side_by_side(self, pictures: Sequence[tuple[Path, str]]) -> None:
+        """Pictures with captions in one row; below each other where the screen is narrow, or the pictures are wide."""
+        figures = "".join(_figure(content, caption) for content, caption in pictures)
+        wide = any(_aspect(content) > _WIDE for content, _ in pictures)
+        self._body.append(f'<div class="pair{" wide" if wide else ""}">{figures}</div>')
 
     def details(self, summary: str, text: str) -> None:
         """Text that unfolds."""
@@ -136,6 +143,32 @@ class Page:
             f"</head><body>\n{chr(10).join(self._body)}\n"
             f'<p class="note">Written by improvo {__version__}.</p>\n{scripts}</body></html>\n',
         )
+
+
+def _swatch(colour: str | None) -> str:
+    return "" if colour is None else f'<i class="swatch" style="background:{colour}"></i> '
+
+
+def _figure(content: bytes | Path, caption: str, narrow: bytes | None = None) -> str:
+    image = f'<img src="{_embedded(content)}" alt="{plain(caption)}">'
+    if narrow is not None:
+        source = f'<source media="(max-width: 600px)" srcset="{_embedded(narrow)}">'
+        image = f"<picture>{source}{image}</picture>"
+    return f"<figure>{image}<figcaption>{plain(caption)}</figcaption></figure>"
+
+
+def _aspect(picture: Path) -> float:
+    """Width over height."""
+    from PIL import Image
+
+    with Image.open(picture) as image:
+        return image.width / image.height
+
+
+def _embedded(content: bytes | Path) -> str:
+    content = content.read_bytes() if isinstance(content, Path) else content
+    kind = "png" if content.startswith(b"\x89PNG") else "jpeg"
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def _asset(name: str) -> str:

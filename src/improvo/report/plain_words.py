@@ -10,6 +10,10 @@ from improvo.odometry.verdict.told_verdicts import verdict_lines
 from improvo.odometry.verdict.verdict import DOUBTFUL
 from improvo.types import Float64, Int64
 
+LABEL_WORDS = (
+    "Ignore: too short, or in between stable and unstable, so it teaches nothing. Withheld: it had a label, which the "
+    "quality gate took away, because the odometry is not to be trusted where the track was seen."
+)
 _DARK = 25.0  # mean grey value below which keypoints become rare
 
 

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from improvo.errors import InputError
+from improvo.errors import PLOTS_MISSING, InputError, plots_installed
 from improvo.odometry.run_folder import RunFolder
 from improvo.odometry.verdict.told_verdicts import verdict_lines, verdict_of
 from improvo.odometry.verdict.verdict import DOUBTFUL
 from improvo.report.charts import line_chart
-from improvo.report.map_picture import map_png
-from improvo.report.page import Page
+from improvo.report.map_picture import map_png, trusted_points
+from improvo.report.page import Page, plain
 from improvo.report.page_data import frames_data, per_frame, scene_data
 from improvo.report.palettes import PALETTES, Palette
-from improvo.report.plain_words import warnings
+from improvo.report.plain_words import LABEL_WORDS, warnings
 from improvo.report.true_path import TruePath, true_path
+from improvo.stability.rule import IGNORE, STABLE, UNSTABLE
 
 _MAX_FRAMES = 150  # of the slider
 _FRAME_WIDTH = 480
+_CODES = {"stable": STABLE, "unstable": UNSTABLE, "ignore": IGNORE}
 
 _SCENE = """
 <div class="controls only-screen">
@@ -29,11 +32,12 @@ _SCENE = """
 <label><input type="radio" name="layer" value="labels"> points by label</label>
 <button type="button" id="scene-reset">Reset</button><button type="button" id="scene-above">From above</button>
 <span class="legend">trajectory: first <i class="ramp" style="background:{gradient}"></i> last; black: last window;
-pink: doubtful; yellow: the frame below{truth}</span></div>
+pink: doubtful; yellow: the frame below{truth}</span><span class="legend" id="scene-labels" hidden>{labels}</span></div>
 <canvas class="scene" id="scene" tabindex="0" aria-label="3D map: drag to turn, shift-drag to move, wheel to zoom">
 </canvas>
 <p class="note only-screen">Drag turns, shift or right button moves, the wheel zooms after a click on the map, two
-fingers zoom and move; arrow keys and + - too. One finger up or down scrolls the page.</p>"""
+fingers zoom and move; arrow keys and + - too. One finger up or down scrolls the page.</p>
+<p class="note">{counts}</p>"""
 
 _TRUTH = '; <i class="swatch" style="background:#7fffd4"></i> true path, each segment aligned'
 
@@ -94,7 +98,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
         _map_section(page, run, palette, truth)
     _frames_section(page, run, data, palette, missing)
     _charts_section(page, run)
-    _labels_section(page, run)
+    _labels_section(page, run, palette)
     _timing_section(page, run)
     page.write(path)
 
@@ -117,13 +121,30 @@ def _path_length(run: RunFolder) -> float:
 
 def _map_section(page: Page, run: RunFolder, palette: Palette, truth: TruePath | None) -> None:
     page.heading("Map and trajectory")
-    page.html(_SCENE.format(gradient=_gradient(palette), truth=_TRUTH if truth is not None else ""))
-    page.script("scene.js", "scene-data", scene_data(run, palette, truth))
+    data, good = scene_data(run, palette, truth), len(trusted_points(run.map))
+    counts = (
+        f"Of {len(run.map):,} map points (map.ply and run.json have all) the {good:,} good ones are shown, seen at "
+        "least three times with less than 2 px of error. A label belongs to a track, of which a point may own several: "
+        f"there are {len(run.points):,}."
+    )
+    page.html(
+        _SCENE.format(
+            gradient=_gradient(palette),
+            truth=_TRUTH if truth is not None else "",
+            labels=" ".join(_legend(palette, ("stable", "unstable"))),
+            counts=plain(counts),
+        )
+    )
+    page.script("scene.js", "scene-data", data)
+    if not plots_installed():
+        page.paragraph(f"The same as a picture, for prints: {PLOTS_MISSING}.", note=True)
+        return
     colours = "from blue to red" if palette.name == "paper" else "from dark to bright"
     page.picture(
         map_png(run, palette),
         f"Seen from above: points as the recording shows them, the trajectory {colours} over time, the last window "
         "black, a pink band under what is doubtful.",
+        map_png(run, palette, narrow=True),
     )
 
 
@@ -135,11 +156,7 @@ def _frames_section(page: Page, run: RunFolder, data: dict[str, object], palette
         page.paragraph(f"The pictures could not be shown: {missing or 'no frame could be read again'}.")
         return
     width = min(2 * _FRAME_WIDTH, 2 * run.camera.width)
-    colours = palette.label_colours(np.array([2, 1, 0]))
-    labels = " ".join(
-        f'<i class="swatch" style="background:rgb{tuple(colour.tolist())}"></i> {name}'
-        for colour, name in zip(colours, ("stable", "unstable", "ignored"), strict=True)
-    )
+    labels = " ".join(_legend(palette, ("stable", "unstable", "ignore")))
     page.html(
         _FRAMES.format(
             last=len(frames) - 1,
@@ -177,7 +194,7 @@ def _charts_section(page: Page, run: RunFolder) -> None:
     )
 
 
-def _labels_section(page: Page, run: RunFolder) -> None:
+def _labels_section(page: Page, run: RunFolder, palette: Palette) -> None:
     tracks, rule = run.points.counts(), run.report["configuration"]["labels"]
     page.heading("Labels")
     page.paragraph(
@@ -187,12 +204,8 @@ def _labels_section(page: Page, run: RunFolder) -> None:
     )
     names = ("stable", "unstable", "ignore", "withheld")
     rows = [(name, float(tracks[name]), f"{tracks[name]:,}") for name in names]
-    page.bars(("label", "tracks"), rows)
-    page.paragraph(
-        "Ignore: too short, or in between stable and unstable, so it teaches nothing. Withheld: it had a label, which "
-        "the quality gate took away, because the odometry is not to be trusted where the track was seen.",
-        note=True,
-    )
+    page.bars(("label", "tracks"), rows, {name: _css(palette, name) for name in names[:3]})
+    page.paragraph(LABEL_WORDS, note=True)
 
 
 def _timing_section(page: Page, run: RunFolder) -> None:
@@ -217,6 +230,16 @@ def _timing_section(page: Page, run: RunFolder) -> None:
     )
     page.details("All settings", json.dumps(report["configuration"], indent=2))
     page.details("Versions", json.dumps(report["versions"], indent=2))
+
+
+def _css(palette: Palette, label: str) -> str:
+    """The colour of a label."""
+    return f"rgb{tuple(palette.label_colours(np.array([_CODES[label]]))[0].tolist())}"
+
+
+def _legend(palette: Palette, labels: Sequence[str]) -> list[str]:
+    """Markup: each label behind its colour."""
+    return [f'<i class="swatch" style="background:{_css(palette, label)}"></i> {label}' for label in labels]
 
 
 def _gradient(palette: Palette) -> str:

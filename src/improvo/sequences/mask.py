@@ -69,6 +69,17 @@ class SequenceMasks:
         """
         return self._read(self._single if self._files is None else self._files[index])
 
+    def raw(self, index: int) -> UInt8:
+        """(H, W) the mask of frame `index` in the size of the recorded picture: 255 used, 0 not, border included.
+
+        Raises:
+            InputError: it cannot be read, or has another size.
+        """
+        file = self._single if self._files is None else self._files[index]
+        raw = _image(file)
+        self._check_size(file, (raw.shape[1], raw.shape[0]))
+        return np.where(_without_border(raw >= _WHITE), np.uint8(255), np.uint8(0))
+
     @property
     def description(self) -> str:
         """What is masked, for a person."""
@@ -93,8 +104,13 @@ def delivered_mask(raw: UInt8, rectifier: Rectifier) -> Mask:
     """(H, W) of the delivered frame: white pixels of the raw mask, without the border around black ones."""
     # every raw pixel that contributes to a delivered one must be white
     white = rectifier.image(np.where(raw >= _WHITE, np.uint8(255), np.uint8(0))) == 255
+    return _without_border(white)
+
+
+def _without_border(white: Mask) -> Mask:
+    """What is farther than the border from black; outside the picture nothing counts as black."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BORDER + 1, 2 * BORDER + 1))
-    return np.asarray(cv2.erode(white.astype(np.uint8), disc), np.bool_)  # outside the picture nothing counts as black
+    return np.asarray(cv2.erode(white.astype(np.uint8), disc), np.bool_)
 
 
 def size_of(file: Path) -> tuple[int, int] | None:

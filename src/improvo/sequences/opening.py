@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
@@ -143,6 +145,12 @@ def _format(name: str) -> type[Recording]:
 
 
 def _installed() -> dict[str, EntryPoint]:
+    return _installed_in(tuple(sys.path))
+
+
+@cache
+def _installed_in(_search_path: tuple[str, ...]) -> dict[str, EntryPoint]:
+    """Readers of other packages; looking for them reads the metadata of every installed package, so it is done once."""
     return {point.name: point for point in entry_points(group=ENTRY_POINT)}
 
 

@@ -157,6 +157,14 @@ class Sequence:
         """Where keypoints may be in the i-th selected frame (H, W); None is everywhere."""
         return self._mask(int(self.indices[i]))
 
+    def raw_mask(self, i: int) -> UInt8 | None:
+        """The mask of the i-th selected frame as recorded, before undistortion (H, W): 255 used, 0 not; None is all.
+
+        Raises:
+            InputError: it cannot be read.
+        """
+        return None if self._masks is None else self._masks.raw(int(self.indices[i]))
+
     def _mask(self, index: int) -> Mask | None:
         return None if self._masks is None else self._masks[index]
 

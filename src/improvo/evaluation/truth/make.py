@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -152,12 +154,15 @@ def _working_folder(output: Path, sequence: Sequence, settings: TruthSettings) -
     """The working folder; one that was made with other frames or settings is refused."""
     folder = output.with_suffix(".work")
     make_output_folder(folder, COMMAND)
-    wanted = {
+    mask = sequence.raw_mask(0)
+    wanted: dict[str, Any] = {
         "recording": str(sequence.path.absolute()),
         "frames": [int(sequence.indices[0]), int(sequence.indices[-1]), len(sequence)],
         "camera": to_dict(sequence.raw_camera),
         "settings": {name: getattr(settings, name) for name in _DECIDING},
     }
+    if mask is not None:
+        wanted["first_mask"] = zlib.crc32(mask.tobytes())
     request = folder / "request.json"
     mend = "delete that folder to begin anew"
     if request.is_file() and read_json_file(request, mend) != json.loads(json.dumps(wanted)):

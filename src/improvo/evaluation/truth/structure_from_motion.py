@@ -1,7 +1,7 @@
 """Structure from motion with COLMAP (Schoenberger and Frahm 2016): images of a recording to poses, points, a camera.
 
-Everything lies in a working folder, so that what was interrupted goes on: `images`, `database.db` with features and
-matches, and `model` with the result.
+Everything lies in a working folder, so that what was interrupted goes on: `images` and, where there are any, `masks`,
+`database.db` with features and matches, and `model` with the result.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from improvo.errors import InputError, MissingExtraError
+from improvo.errors import InputError, imported
 from improvo.evaluation.truth.settings import TruthSettings
 from improvo.files import write_picture
 from improvo.geometry.camera import Camera
@@ -58,10 +58,7 @@ def load_pycolmap() -> Any:
     Raises:
         MissingExtraError: it is not installed.
     """
-    try:
-        import pycolmap
-    except ImportError:
-        raise MissingExtraError("structure from motion", "truth") from None
+    pycolmap = imported("pycolmap", "structure from motion", "truth")
     pycolmap.logging.minloglevel = 3  # FATAL: what goes wrong is told by what is missing from the result
     return pycolmap
 
@@ -104,7 +101,7 @@ def reconstruct(
             "k1 k2 p1 p2; undistort the images first"
         )
     if not (folder / "model").is_dir():
-        names = _write_images(sequence, folder / "images", progress)
+        names = _write_images(sequence, folder, progress)
         _extract(pycolmap, folder, names, start, settings, threads, progress)
         _match(pycolmap, folder, names, settings, threads, progress)
         best = _map(pycolmap, folder, len(names), settings, threads, progress)
@@ -166,17 +163,25 @@ def _image(image: Any, good: dict[int, Float64]) -> ReconstructedImage:
 
 
 def _write_images(sequence: FrameSequence, folder: Path, progress: Progress) -> list[str]:
-    """The raw images as grey PNG, named by their number in the recording; unreadable frames are left out."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """The raw images as grey PNG, named by their number in the recording, and their masks where COLMAP looks for them.
+
+    Unreadable frames are left out.
+    """
+    images, masks = folder / "images", folder / "masks"
+    images.mkdir(parents=True, exist_ok=True)
     names = []
     for done, index in enumerate(sequence.indices.tolist()):
         name = f"{index:06d}.png"
-        if not (folder / name).is_file():
+        if not (images / name).is_file():
             try:
                 image = grey(sequence.recording.image(index))
             except UnreadableFrameError:
                 continue
-            write_picture(folder / name, image)
+            mask = sequence.raw_mask(done)
+            if mask is not None:
+                masks.mkdir(exist_ok=True)
+                write_picture(masks / f"{name}.png", mask)
+            write_picture(images / name, image)
         names.append(name)
         progress("images", done + 1, len(sequence))
     return names
@@ -197,6 +202,8 @@ def _extract(
     distortion = (*start.distortion, 0.0, 0.0, 0.0, 0.0)[:4]
     parameters = (start.fx, start.fy, start.cx + 0.5, start.cy + 0.5, *distortion)
     reader.camera_params = ",".join(repr(float(value)) for value in parameters)
+    if (folder / "masks").is_dir():
+        reader.mask_path = folder / "masks"
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.use_gpu = threads, False
     options.sift.max_num_features = settings.max_features

@@ -101,7 +101,8 @@ def _scaled(points: Float64, segment: Int64, maps: dict[int, SegmentMap]) -> Flo
 def _entry(estimates: dict[int, ScaleEstimate], segments: int, settings: ScaleSettings) -> dict[str, Any]:
     """What run.json says about it."""
     first = next(iter(estimates.values()))
-    text = f"metres, {_WORDS[settings.source]}"
+    words = "from known distances" if len(settings.distances) > 1 else _WORDS[settings.source]
+    text = f"metres, {words}"
     text += f" ({first.surety})" if first.surety else ""
     unknown = [number for number in range(segments) if number not in estimates]
     if unknown:

@@ -1,6 +1,9 @@
-"""Scale by a known distance between the camera's places at two frames."""
+"""Scale by known distances between the camera's places at two frames each."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence as List
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,6 +15,17 @@ from improvo.sequences import Sequence
 
 _DRIFT = 0.01  # of the way between the frames, as odometry usually has it
 _MOST_ERROR = 0.3  # of the distance, by that drift
+_TAPE = 0.01  # of a distance, as a person measures it
+_CONTRADICTS = 3.0  # standard errors between two distances, beyond which one of them is wrong
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """What one distance says."""
+
+    frames: tuple[int, int]  # numbers in the recording
+    factor: float  # metres a unit
+    error: float  # relative, by the odometry's drift
 
 
 def check_frames(sequence: Sequence, settings: ScaleSettings) -> None:
@@ -20,43 +34,78 @@ def check_frames(sequence: Sequence, settings: ScaleSettings) -> None:
     Raises:
         InputError: one of them is not.
     """
-    assert settings.frames is not None
-    for frame in settings.frames:
-        if frame not in sequence.indices:
-            raise InputError(
-                f"--scale distance: frame {frame} is not among those that are read ({sequence.indices[0]} to "
-                f"{sequence.indices[-1]}, every {sequence.settings.stride}); numbers are those of the recording"
-            )
+    for first, last, _ in settings.distances:
+        for frame in (first, last):
+            if frame not in sequence.indices:
+                raise InputError(
+                    f"--scale distance: frame {frame} is not among those that are read ({sequence.indices[0]} to "
+                    f"{sequence.indices[-1]}, every {sequence.settings.stride}); numbers are those of the recording"
+                )
 
 
 def scale_from_distance(run: TrackedRun, settings: ScaleSettings) -> dict[int, ScaleEstimate]:
-    """Of the segment that both frames belong to.
+    """Of each segment that both frames of a distance belong to; several distances of one segment are averaged.
 
     Raises:
-        InputError: a frame without a pose, two segments, or two places too near to each other for the way between.
+        InputError: a frame without a pose, two segments, two places too near to each other for the way between, or
+            distances that contradict each other.
     """
-    assert settings.frames is not None
-    assert settings.metres is not None
+    measured: dict[int, list[_Measured]] = {}
+    for first, last, metres in settings.distances:
+        segment, one = _measured(run, first, last, metres)
+        measured.setdefault(segment, []).append(one)
+    return {segment: _together(measured[segment]) for segment in sorted(measured)}
+
+
+def _measured(run: TrackedRun, first: int, last: int, metres: float) -> tuple[int, _Measured]:
+    """The segment of a distance, and what it says."""
     rows = []
-    for number in settings.frames:
+    for number in (first, last):
         found = np.flatnonzero(run.source_index == number)
         if len(found) == 0 or not run.trajectory.valid[found[0]]:
             raise InputError(f"--scale distance: frame {number} has no pose; take frames that have one (run.json)")
         rows.append(int(found[0]))
-    first, last = sorted(rows)
-    segment = run.trajectory.segment[[first, last]]
+    low, high = sorted(rows)
+    segment = run.trajectory.segment[[low, high]]
     if segment[0] != segment[1]:
         raise InputError(
-            f"--scale distance: tracking began anew between frames {settings.frames[0]} and {settings.frames[1]}, so "
-            "that they share no scale; take two frames of one segment (run.json)"
+            f"--scale distance: tracking began anew between frames {first} and {last}, so that they share no scale; "
+            "take two frames of one segment (run.json)"
         )
     between = run.frames(int(segment[0]))
-    centres = run.trajectory.camera_centers[between[(between >= first) & (between <= last)]]
+    centres = run.trajectory.camera_centers[between[(between >= low) & (between <= high)]]
     way = float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
     distance = float(np.linalg.norm(centres[-1] - centres[0]))
     if distance <= 0 or _DRIFT * way > _MOST_ERROR * distance:
         raise InputError(
-            f"--scale distance: the camera is at nearly the same place in frames {settings.frames[0]} and "
-            f"{settings.frames[1]}, for the way between them; take two that lie further apart"
+            f"--scale distance: the camera is at nearly the same place in frames {first} and {last}, for the way "
+            "between them; take two that lie further apart"
         )
-    return {int(segment[0]): ScaleEstimate(settings.metres / distance, _DRIFT * way / distance, 1)}
+    return int(segment[0]), _Measured((first, last), metres / distance, _DRIFT * way / distance)
+
+
+def _together(measured: List[_Measured]) -> ScaleEstimate:
+    """One scale from the distances of a segment, the surer ones counting more.
+
+    Raises:
+        InputError: two of them differ by more than drift and tape explain.
+    """
+    if len(measured) == 1:
+        return ScaleEstimate(measured[0].factor, measured[0].error, 1)
+    logs, errors = np.log([each.factor for each in measured]), np.array([each.error for each in measured])
+    variance = errors**2 + _TAPE**2
+    apart = np.abs(logs[:, None] - logs) / np.sqrt(variance[:, None] + variance)
+    one, other = sorted(divmod(int(apart.argmax()), len(measured)))
+    if apart[one, other] > _CONTRADICTS:
+        a, b = measured[one], measured[other]
+        raise InputError(
+            f"--scale distance: frames {a.frames[0]} and {a.frames[1]} give {a.factor:.4g} m a unit, frames "
+            f"{b.frames[0]} and {b.frames[1]} give {b.factor:.4g} m, {100 * abs(b.factor / a.factor - 1):.2g} % apart; "
+            "measure again, or leave one out"
+        )
+    weights = 1 / variance
+    mean = float(np.average(logs, weights=weights))
+    expected = 1 / np.sqrt(weights.sum())
+    # what they really differ by counts where it is more than expected
+    excess = np.sqrt(np.average((logs - mean) ** 2, weights=weights) / (len(measured) - 1))
+    return ScaleEstimate(float(np.exp(mean)), float(max(expected, excess)), len(measured))

@@ -3,46 +3,92 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import datetime, timezone
 
 import numpy as np
 
 from improvo.errors import InputError
 from improvo.geometry.alignment import align_points
+from improvo.geometry.position_track import (
+    PositionTrack,
+    is_position_track,
+    read_position_track,
+    time_in_seconds,
+)
 from improvo.geometry.trajectory_files import read_trajectory
 from improvo.odometry.scale.estimate import ScaleEstimate, from_measurements
 from improvo.odometry.scale.settings import ScaleSettings
 from improvo.odometry.scale.tracked import TrackedRun
 from improvo.sequences import Sequence
-from improvo.sequences.association import poses_at
+from improvo.sequences.association import nearest, poses_at
 from improvo.types import Float64, Trajectory
 
 _STRETCHES = 10  # of a segment, whose lengths are compared
 _LEAST_MOVE = 0.1  # of the longest stretch; shorter ones say little
+_FIRST_DATE = 6.3e8  # seconds; larger times are dates, smaller ones count from some start
 _MOST_ERROR = 0.4  # of its own extent, after alignment, beyond which the two do not belong together
 
 
 def reference_of(sequence: Sequence, settings: ScaleSettings) -> Trajectory:
     """The trajectory in metres, at the times of the sequence's frames, before any work.
 
+    Of a GPS track only the places are known: each belongs to the frame nearest in time, and its rotation says nothing.
+
     Raises:
         InputError: there is none, or it has no pose at their times.
     """
-    truth = sequence.ground_truth
-    name = str(sequence.path)
-    if settings.reference is not None:
+    if settings.reference is None:
+        truth = sequence.ground_truth
+        if truth is None:
+            raise InputError(
+                f"--scale truth: {sequence.path} has no true poses; give a trajectory in metres or a GPS track "
+                "(--scale truth FILE) or take another source"
+            )
+        name, span = str(sequence.path), ""
+    else:
         name = settings.reference
-        truth = poses_at(read_trajectory(settings.reference), sequence.times)
-    if truth is None:
-        raise InputError(
-            f"--scale truth: {name} has no true poses; give a trajectory in metres (--scale truth FILE) or take "
-            "another source"
-        )
+        shift = 0.0 if settings.began is None else time_in_seconds(settings.began)
+        if not np.isfinite(shift):
+            raise InputError(
+                f"--scale truth: {settings.began} is no time; give a date such as 2026-05-01T10:00:00Z, or seconds"
+            )
+        times = sequence.times + shift
+        if is_position_track(name):
+            track = read_position_track(name)
+            truth, own = _at_frames(track, times), track.times
+        else:
+            try:
+                given = read_trajectory(name)
+            except InputError as error:
+                raise InputError(f"{error}, or a GPS track (GPX, or a table with latitude and longitude)") from None
+            truth, own = poses_at(given, times), given.times
+        truth = replace(truth, times=sequence.times)
+        span = f" (it lasts from {_when(own[0])} to {_when(own[-1])}, the recording from {_when(times[0])} to "
+        span += f"{_when(times[-1])})"
     if truth.valid.sum() < 3:
         raise InputError(
-            f"--scale truth: {name} has poses at the times of {int(truth.valid.sum())} frames, three are needed; "
-            "bring both to one clock, in seconds"
+            f"--scale truth: {name} has a place at the times of {int(truth.valid.sum())} frames, three are "
+            f"needed{span}; bring both to one clock: --scale truth FILE BEGAN says when the recording began"
         )
     return truth
+
+
+def _at_frames(track: PositionTrack, times: Float64) -> Trajectory:
+    """The places of a track, each at the frame nearest to it in time; other frames have none."""
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    frame = nearest(track.times, times, 0.5 * step + 1e-6)
+    poses = np.full((len(times), 4, 4), np.nan)
+    known = frame >= 0
+    poses[frame[known]] = np.eye(4)
+    poses[frame[known], :3, 3] = track.xyz[known]
+    return Trajectory(times, poses, np.where(np.isfinite(poses[:, 0, 3]), 0, -1))
+
+
+def _when(seconds: float) -> str:
+    """A time for a person: a date where it is one."""
+    if seconds < _FIRST_DATE:
+        return f"{seconds:.1f} s"
+    return datetime.fromtimestamp(seconds, timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def scale_from_truth(run: TrackedRun, reference: Trajectory) -> dict[int, ScaleEstimate]:

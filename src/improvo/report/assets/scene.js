@@ -197,6 +197,8 @@
   for (const choice of document.querySelectorAll("input[name=layer]"))
     choice.addEventListener("change", () => {
       layer = choice.value;
+      const legend = document.getElementById("scene-labels");
+      if (legend) legend.hidden = layer !== "labels";
       redraw();
     });
   document.addEventListener("improvo-frame", (event) => {
