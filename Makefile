@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: demo test lint docs locked clean
+.PHONY: demo test test-cluster lint docs locked clean
 
 demo: $(VENV)/.run-installed
 	$(BIN)/improvo demo -o output/demo
@@ -12,6 +12,11 @@ demo: $(VENV)/.run-installed
 test: $(VENV)/.dev-installed lint
 	$(BIN)/python -m pytest --ignore-glob='*/test_training_*'
 	$(BIN)/python -m pytest tests/test_training_*.py
+
+# What `make test` skips for want of the packages: a Ray cluster of two nodes and an S3 server, both of this machine.
+test-cluster: $(VENV)/.cluster-installed
+	$(BIN)/python -m pytest -rs tests/test_jobs_on_ray.py tests/test_locations.py
+	$(BIN)/python -m pytest -rs tests/test_training_locations.py
 
 lint: $(VENV)/.dev-installed
 	$(BIN)/ruff check .
@@ -35,6 +40,10 @@ $(VENV)/.dev-installed: $(VENV)/bin/python pyproject.toml
 	$(BIN)/pip install --quiet -e '.[dev]'
 	$(BIN)/pip install --quiet evo  # GPL: the tests run its commands beside us to compare figures; never imported
 	touch $@ $(VENV)/.run-installed
+
+$(VENV)/.cluster-installed: $(VENV)/.dev-installed
+	$(BIN)/pip install --quiet -e '.[ray,remote]' 'moto[server]>=5'
+	touch $@
 
 # The versions that requirements-dev.txt names, by their hashes; `make locked test` tests with them. To renew the file:
 # uv pip compile pyproject.toml --extra dev --universal --python-version 3.10 --no-emit-index-url --generate-hashes

@@ -44,8 +44,8 @@ class TooSlowError(BaseException):
 class Record:
     """How often each target was executed, over all runs, and the faults that were found."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, first_seed: int) -> None:
+        self._path, self._first_seed = path, first_seed
         self.targets: dict[str, dict[str, float]] = {}
         self.faults: dict[str, str] = {}  # target and place -> the first file that shows it
         if path.exists():
@@ -54,7 +54,7 @@ class Record:
 
     def of(self, name: str) -> dict[str, float]:
         """What is known of a target."""
-        return self.targets.setdefault(name, {"executions": 0, "next_seed": 0, "processor_seconds": 0.0})
+        return self.targets.setdefault(name, {"executions": 0, "next_seed": self._first_seed, "processor_seconds": 0.0})
 
     def seconds_left(self, name: str, each: int) -> float:
         """The processor time that a target still needs for that many executions; none if it never ran."""
@@ -83,6 +83,7 @@ def main() -> None:
     """Round and round over the targets until the time is up or each has had its executions."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--seed", type=int, default=0, help="of the first execution of a target that has had none")
     parser.add_argument("--each", type=int, default=200_000, help="executions of a target, all runs together")
     parser.add_argument(
         "--finish", action="store_true", help="not in turns: always the target that lacks the least processor time"
@@ -95,7 +96,7 @@ def main() -> None:
         again(arguments.again)
         return
     names = [name for name in targets() if not arguments.only or name.startswith(tuple(arguments.only))]
-    record = Record(arguments.corpus / "record.json")
+    record = Record(arguments.corpus / "record.json", arguments.seed)
     known = len(record.faults)
     end = time.monotonic() + 60 * arguments.minutes
     while time.monotonic() < end:

@@ -200,15 +200,8 @@ def _width(arguments: argparse.Namespace) -> list[str]:
 
 def plan(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """Core-seconds as planned, and as one worker process then takes them."""
-    command = [
-        sys.executable,
-        "-m",
-        "improvo",
-        "label",
-        *map(str, arguments.sequences),
-        "--frontend",
-        arguments.frontend,
-    ]
+    command = [sys.executable, "-m", "improvo", "label", *map(str, arguments.sequences)]
+    command += ["--frontend", arguments.frontend, *_width(arguments)]
     said = subprocess.run([*command, "--plan", "--json"], check=True, stdout=subprocess.PIPE, text=True).stdout
     planned = json.loads(said)
     store = arguments.folder / "labels-planned"

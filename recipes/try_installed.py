@@ -37,6 +37,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=60)
     arguments = parser.parse_args()
     import improvo
+    from improvo.errors import plots_installed
 
     if "site-packages" not in str(improvo.__file__):
         sys.exit(f"{improvo.__file__}: is the source, not an installed wheel")
@@ -48,9 +49,13 @@ def main() -> None:
         tracked = report["frames"]["tracked"]
         assert tracked > 0.8 * arguments.frames, f"{tracked} of {arguments.frames} frames have a pose"
         print(f"{tracked} of {arguments.frames} frames have a pose; versions: {report['versions']}", flush=True)
-        try_command(folder, "show", "map", "out")
+        try_command(folder, "show", "labels", "out")
         try_command(folder, "report", "out")
-        assert list(folder.rglob("*.png")), "no picture of the map"
+        assert list(folder.rglob("*.png")), "no picture of the labels"
+        if plots_installed():
+            try_command(folder, "show", "map", "out")
+        else:
+            refused_in_one_line(folder, "improvo[plots]", "show", "map", "out")
         assert list(folder.rglob("*.html")), "no report"
         try_command(folder, "run", "demo", "-o", "sift", "--frontend", "sift", "--max-frames", "20")
         (folder / "snippet.py").write_text(SNIPPET, encoding="utf-8")
@@ -60,6 +65,16 @@ def main() -> None:
 def try_command(folder: Path, *words: str) -> None:
     """A command of improvo."""
     timed([sys.executable, "-m", "improvo", *words, "--quiet"], folder)
+
+
+def refused_in_one_line(folder: Path, mend: str, *words: str) -> None:
+    """A command that needs an extra says so in one line, and ends with 2."""
+    command = [sys.executable, "-m", "improvo", *words]
+    ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2, ended
+    assert mend in ended.stderr, ended
+    assert ended.stderr.count("\n") == 1, ended
+    print(f"        {ended.stderr.strip()}", flush=True)
 
 
 def timed(command: list[str], folder: Path) -> None:

@@ -71,6 +71,24 @@ sys.exit(main(["info", {str(folder)!r}, "--fov", "60", "--quiet"]))
     assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows does not remove a folder that a process is in")
+@pytest.mark.parametrize("words", [("run", "x", "-o", "out", "--fov", "60"), ("info", "x", "--camera", "auto")])
+def test_a_working_folder_that_was_removed(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = tmp_path / "gone"
+    place.mkdir()
+    monkeypatch.chdir(place)
+    place.rmdir()
+    try:
+        assert main(words) == 2
+    finally:
+        monkeypatch.chdir(tmp_path)
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "removed" in told or "no such file" in told
+
+
 def test_results_that_name_pictures_elsewhere_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "results"
     folder.mkdir()

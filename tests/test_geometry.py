@@ -31,6 +31,38 @@ def test_rotation_angle_is_exact_at_both_ends(degrees: float) -> None:
     assert se3.rotation_angle_deg(rotation) == pytest.approx(degrees, abs=1e-9)
 
 
+@pytest.mark.parametrize("degrees", [0.0, 1e-9, 1e-3, 0.05, 0.06, 30.0, 120.0, 179.9999])
+def test_rotations_vectors_and_quaternions_undo_each_other(degrees: float) -> None:
+    vectors = np.radians(degrees) * np.vstack([np.eye(3), -np.eye(3), np.full(3, 3**-0.5)])
+    rotations = se3.so3_exp(vectors)
+    np.testing.assert_allclose(se3.so3_log(rotations), vectors, atol=1e-11)
+    np.testing.assert_allclose(
+        rotations @ np.swapaxes(rotations, 1, 2), np.broadcast_to(np.eye(3), (7, 3, 3)), atol=1e-15
+    )
+    quats = se3.quat_xyzw_from_rotation(rotations)
+    assert (quats[:, 3] >= 0).all()
+    np.testing.assert_allclose(se3.rotation_from_quat_xyzw(-3 * quats), rotations, atol=1e-15)
+
+
+def test_rotations_are_those_of_scipy() -> None:
+    Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
+    rng = np.random.default_rng(1)
+    vectors = rng.normal(size=(500, 3)) * np.exp(rng.uniform(-14, 1, (500, 1)))
+    theirs = Rotation.from_rotvec(vectors)
+    np.testing.assert_allclose(se3.so3_exp(vectors), theirs.as_matrix(), atol=1e-15)
+    np.testing.assert_allclose(se3.so3_log(theirs.as_matrix()), theirs.as_rotvec(), atol=1e-14)
+    np.testing.assert_allclose(
+        se3.quat_xyzw_from_rotation(theirs.as_matrix()), theirs.as_quat(canonical=True), atol=1e-15
+    )
+
+
+def test_a_half_turn_has_a_vector_of_length_pi_and_a_quaternion_without_length_is_refused() -> None:
+    half = np.diag([1.0, -1.0, -1.0])
+    np.testing.assert_allclose(np.abs(se3.so3_log(half)), [np.pi, 0, 0], atol=1e-12)
+    with pytest.raises(ValueError, match="zero"):
+        se3.rotation_from_quat_xyzw(np.zeros((2, 4)))
+
+
 def test_nearest_rotation_mends_a_slightly_wrong_one() -> None:
     rotation = se3.so3_exp(np.array([0.2, -0.4, 0.1]))
     mended = se3.nearest_rotation(rotation + 1e-4 * np.arange(9).reshape(3, 3))

@@ -16,7 +16,7 @@ from improvo.errors import ImprovoError, InputError, OutputError
 from improvo.evaluation.pose.self_truth import FixedRun
 from improvo.frontend.settings import FrontendSettings
 from improvo.geometry.camera import Camera
-from improvo.improvement.estimate import estimate, refuse_full_disk
+from improvo.improvement.estimate import Costs, estimate, refuse_full_disk
 from improvo.improvement.gaps import choose_gaps, median_overlap
 from improvo.improvement.recipe import steps_of
 from improvo.improvement.reference import (
@@ -154,11 +154,14 @@ def test_the_estimate_grows_with_the_work_and_a_full_disk_is_said_before_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = ImproveSettings()
-    small = estimate(settings, 1, 480, 120, 640 * 480, 300_000)
+    small = estimate(settings, 1, 480, 120, 640 * 480, Costs.usual(640 * 480, 300_000))
     assert 5 < small.minutes < 30  # with the defaults
-    assert estimate(settings, 2, 480, 120, 640 * 480, 300_000).minutes > small.minutes
-    assert estimate(replace(settings, control=True), 1, 480, 120, 640 * 480, 300_000).minutes > small.minutes
-    assert estimate(settings, 1, 48_000, 12_000, 640 * 480, 300_000).disk_mib > small.disk_mib
+    assert estimate(settings, 2, 480, 120, 640 * 480, Costs.usual(640 * 480, 300_000)).minutes > small.minutes
+    assert (
+        estimate(replace(settings, control=True), 1, 480, 120, 640 * 480, Costs.usual(640 * 480, 300_000)).minutes
+        > small.minutes
+    )
+    assert estimate(settings, 1, 48_000, 12_000, 640 * 480, Costs.usual(640 * 480, 300_000)).disk_mib > small.disk_mib
     assert "minutes on two calm cores" in small.words
     refuse_full_disk(tmp_path / "not" / "there", small)
     usage = type("Usage", (), {"free": 2**20})

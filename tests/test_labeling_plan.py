@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from rendered_walk import write_walk
 
+from improvement_example import SETTINGS as EXAMPLE
 from improvo.cli.main import main
 from improvo.cli.plan import duration, size, useful_workers
 from improvo.errors import InputError
+from improvo.frontend.weights import find_weights
+from improvo.improvement.estimate import Costs
+from improvo.improvement.plan import plan_improvement
+from improvo.improvement.plan_sample import measure
+from improvo.improvement.settings import ImproveSettings
 from improvo.labeling import plan as module
 from improvo.labeling.plan import LabelPlan, plan_labels
+from improvo.labeling.store import DONE, SequenceRecord
 from improvo.odometry.run_settings import LabelRunSettings, RunSettings
+from improvo.sequences.base import SequenceSettings
 
 ORB = ["--frontend", "orb", "--max-keypoints", "200", "--set", "labels.min_observations=6"]
 ORB += ["--set", "labels.quality.enabled=false"]
@@ -76,6 +85,47 @@ def test_samples_are_short_and_of_a_few_recordings(tmp_path: Path, monkeypatch: 
     assert done == [("0", 150, True), ("4", 150, True), ("8", 150, True)]
 
 
+def test_more_recordings_are_sampled_where_they_are_short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+
+    def here(work: object, jobs: list, on_result: object, on_ticks: object, workers: int) -> None:
+        done.extend(job.path.name for job in jobs)
+        for job in jobs:
+            on_result(job, InputError("dark"))
+
+    monkeypatch.setattr(module, "run_in_processes", here)
+    monkeypatch.setattr(module, "_lengths", lambda paths, settings: dict.fromkeys(paths, 60))
+    with pytest.raises(InputError, match="no sample"):
+        plan_labels([tmp_path / f"{n}" for n in range(40)], LabelRunSettings())
+    assert done == ["0", "6", "13", "20", "26", "32", "39"]
+
+
+@pytest.mark.parametrize(("whole", "recording", "frame"), [(True, 10.0, 2.0), (False, 40.0, 1.0)])
+def test_the_start_of_a_map_is_a_cost_of_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: bool, recording: float, frame: float
+) -> None:
+    """Opening takes 10 s, each of the first 30 frames 2 s, the others 1 s; of a whole sample all take 2 s."""
+    clock = iter([0.0, *(12.0 + 2 * n for n in range(30)), *(71.0 + (2 if whole else 1) * n for n in range(30)), 999.0])
+    end = 130.0 if whole else 100.0
+    seen: list[float] = []
+
+    def process_time() -> float:
+        seen.append(next(clock) if len(seen) < 61 else end)
+        return seen[-1]
+
+    def label(job: module.LabelJob, tick: object) -> SequenceRecord:
+        for _ in range(60):
+            tick()  # type: ignore[operator]
+        return SequenceRecord("a", "", DONE, frames=60)
+
+    monkeypatch.setattr(module.time, "process_time", process_time)
+    monkeypatch.setattr(module, "label_sequence", label)
+    settings = LabelRunSettings(sequence=SequenceSettings(max_frames=100 if whole else 60))
+    sample = module._sampled(module.LabelJob("a", tmp_path, tmp_path, settings, False), lambda: None)
+    assert sample.frame == pytest.approx(frame, rel=0.03)
+    assert sample.recording == pytest.approx(recording, abs=2.1)
+
+
 def test_recordings_that_cannot_be_opened_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "empty").mkdir()
     assert main(["label", "--plan", str(tmp_path / "empty")]) == 2
@@ -98,15 +148,48 @@ def test_the_loop_labels_more_than_once(
         measured.append(Path(settings.frontend.name).name)
         return plan_of(frames=1000, recordings=len(paths))
 
+    def costs(store: Path, weights: Path, settings: object, usual: Costs) -> Costs:
+        return replace(usual, depth=1.0, step=2.0, pair=0.5, start=10.0)
+
+    monkeypatch.setattr("improvo.improvement.plan.measure", costs)
     monkeypatch.setattr("improvo.improvement.plan.plan_labels", plan)
     walk = str(write_walk(tmp_path / "attic", frames=4, seed=0))
     assert main(["improve", "--plan", walk, "--rounds", "2", "--frontend", "superpoint-small", "--json"]) == 0
     values = json.loads(capsys.readouterr().out)
     assert measured == ["superpoint-small.safetensors"]
-    assert values["labelings"] == pytest.approx(2.8)  # twice all, once more the four fifths that are trained on
-    assert values["labelling"]["core_hours"] == pytest.approx(2.8 * (1000 * 0.1 + 2.0) / 3600, abs=1e-3)
-    assert values["others"]["other_minutes"] > 0
+    # twice all, once more the four fifths that are trained on, and in each round the fifth held back
+    assert values["labelings"] == pytest.approx(3.2)
+    assert values["labelling"]["core_hours"] == pytest.approx(3.2 * (1000 * 0.1 + 2.0) / 3600, abs=1e-3)
+    depth, training, pairs = 800 + 200, 2 * (10 + 2 * 1200), 3 * 3 * 100 * 0.5
+    assert values["others"]["other_minutes"] == pytest.approx((depth + training + pairs) / 60)
+    assert values["others"]["measured"]
     assert [path.name for path in tmp_path.iterdir()] == ["attic"]
+
+
+def test_whole_recordings_are_not_labelled_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("improvo.improvement.plan.plan_labels", lambda paths, settings, **_: plan_of(frames=1000))
+    monkeypatch.setattr("improvo.improvement.plan.measure", lambda *_: None)
+    walks = [write_walk(tmp_path / f"{n}", frames=4, seed=0) for n in range(2)]
+    plan = plan_improvement(walks, ImproveSettings(), 1)
+    assert plan.labelings == pytest.approx(1.2)
+    assert not plan.measured
+
+
+def test_the_parts_of_the_loop_are_measured(tmp_path: Path) -> None:
+    pytest.importorskip("torch", reason="training needs the extra `train`")
+    walk = write_walk(tmp_path / "attic", frames=12, seed=3)
+    settings = replace(EXAMPLE, frontend=replace(EXAMPLE.frontend, name="superpoint-small"))
+    settings = replace(settings, held=replace(settings.held, longer_side=96))
+    run_settings = settings.run_settings(settings.sequence, settings.frontend)
+    plan_labels([walk], run_settings, folder=tmp_path / "plan" / "labels")
+    usual = Costs(frame=1.0, depth=-1.0, step=-1.0, pair=-1.0, start=-1.0)
+    found = measure(tmp_path / "plan" / "labels", find_weights("superpoint-small"), settings, usual)
+    assert found is not None
+    assert found.frame == 1.0
+    assert 0.001 < found.depth < 10
+    assert 0.001 < found.step < 30
+    assert 0 <= found.start < 100
+    assert 0.001 < found.pair < 10
 
 
 def test_sizes_and_durations_read_well() -> None:

@@ -89,7 +89,7 @@ def test_a_sequence_that_another_process_labels_is_waited_for(
 
     monkeypatch.setattr(module, "_labeled", labelled)
     store = tmp_path / "labels"
-    LabelStore(store, module._fingerprint(LabelRunSettings(), False), kind=LabelRunSettings)
+    LabelStore(store, module.fingerprint(LabelRunSettings(), False), kind=LabelRunSettings)
     holder = hold(lock_of(store, "attic"))
     waited: list[tuple[str, str]] = []
 

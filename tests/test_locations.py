@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,12 @@ from improvo import locations
 from improvo.cli.main import main
 from improvo.errors import InputError, OutputError
 from improvo.files import write_text
+from improvo.folder_lock import locked, seems_held
 from improvo.frontend.settings import FrontendSettings
+from improvo.labeling import label_sequences as label_module
 from improvo.labeling.label_sequences import LabelJob, label_sequence
 from improvo.labeling.labeled import read_labels
-from improvo.locations import fetched, is_remote, local_folder, publish, with_urls
+from improvo.locations import claim, fetched, is_remote, local_folder, publish, with_urls
 from improvo.odometry.run_settings import LabelRunSettings
 from improvo.stability.settings import LabelQualitySettings, LabelSettings
 from labeled_scene import write_labeled_scene
@@ -143,6 +147,56 @@ def test_a_full_bucket_is_one_line_and_a_second_start_goes_on(memory: str) -> No
     assert names(memory) == {"a.txt"}
 
 
+def test_labelling_ends_where_the_store_vanishes_and_goes_on_later(
+    memory: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    walks = [str(write_walk(tmp_path / name, frames=16, seed=0)) for name in ("attic", "hall", "kitchen")]
+    words = ["label", *walks, "-o", memory, *ORB]
+    tries: list[str] = []
+    file_system = locations.Place.fs.fget
+    assert file_system is not None
+
+    def gone(self: locations.Place) -> Any:
+        real = file_system(self)
+        if not any(name.endswith("attic/label.json") for name in real.find("bucket")):
+            return real
+        return Failing(real, "info", 1000, TimeoutError("no answer"))
+
+    with monkeypatch.context() as away:
+        away.setattr(locations.Place, "fs", property(gone))
+        away.setattr(time, "sleep", lambda seconds: tries.append("again"))
+        assert main(words) == 2
+    said = capsys.readouterr()
+    assert said.out.count("frames with a pose") == 1
+    assert f"{memory}: cannot be read (no answer); try again" in said.err
+    assert len(tries) == 2
+    assert main(words) == 0
+    assert "3 of 3 sequences labelled" in capsys.readouterr().out
+
+
+def test_where_it_does_not_answer_one_try_is_enough_to_see_whether_it_is_back(memory: str) -> None:
+    folder = local_folder(memory)
+    opened = locations._places[folder]
+    opened._fs = Failing(opened.fs, "put_file", 4, TimeoutError("slow"))
+    for left in (1, 0):
+        with pytest.raises(OutputError, match="cannot be written"):
+            write_text(folder / "a.txt", "one")
+        assert opened._fs.left == left
+    write_text(folder / "b.txt", "two")
+    publish(folder)
+    assert names(memory) == {"a.txt", "b.txt"}
+
+
+def test_a_location_that_lost_all_of_it_is_begun_anew(memory: str, tmp_path: Path) -> None:
+    words = ["label", str(write_walk(tmp_path / "attic", frames=16, seed=0)), "-o", memory, *ORB]
+    assert main(words) == 0
+    there = names(memory)
+    fsspec.filesystem("memory").store.clear()
+    locations._places.clear()
+    assert main(words) == 0
+    assert names(memory) == there
+
+
 def test_a_store_that_vanishes_is_one_line(memory: str, tmp_path: Path) -> None:
     upload(write_labeled_scene(tmp_path / "labels"), memory)
     folder = local_folder(memory, writing=False)
@@ -170,3 +224,92 @@ def test_relabelling_clears_the_location(memory: str, tmp_path: Path, cache: Pat
     (tmp_path / "attic" / "camera.yaml").write_text("damaged")
     assert main([*words, "--set", "labels.min_observations=7", "--relabel"]) == 2
     assert not any(name.startswith("attic/") for name in names(memory))
+
+
+def other_machine(url: str, tmp_path: Path) -> locations.Place:
+    """The location as another machine sees it."""
+    folder = tmp_path / "elsewhere" / "files"
+    folder.mkdir(parents=True)
+    return locations.Place(url, folder, True)
+
+
+@pytest.fixture
+def quick_claims(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(claim, "BEAT_SECONDS", 0.2)
+    monkeypatch.setattr(claim, "_LOOK_SECONDS", 0.05)
+    monkeypatch.setattr(claim, "_SETTLE_SECONDS", 0.0)
+
+
+def check_lock(url: str, tmp_path: Path) -> None:
+    """The second one is told who is there; after the first has ended, or died, it is free."""
+    there = other_machine(url, tmp_path)
+    mine = {"process": 7, "host": "far-away", "since": "2026-11-28 03:00:00", "token": "a"}
+    held = claim.Claim(there, there.folder / ".improvo.lock", mine, lambda holder: False)
+    here = local_folder(url)
+    with pytest.raises(OutputError, match=r"process 7 on far-away \(since .*\) is at work there"), locked(here):
+        pass
+    assert seems_held(here / ".improvo.lock")
+    held.release()
+    with locked(here):
+        assert names(url) == {".improvo.lock"}
+    assert names(url) == set()
+    died = claim.Claim(there, there.folder / ".improvo.lock", mine, lambda holder: False)
+    died._released.set()  # without a beat
+    time.sleep(0.5)
+    with locked(here):
+        found = claim.read_claim(there, there.folder / ".improvo.lock")
+        assert found is not None
+        assert found["process"] == os.getpid()
+        died.release()  # is not its own any more
+    assert names(url) == set()
+
+
+def test_a_lock_at_a_location_in_memory(memory: str, tmp_path: Path, quick_claims: None) -> None:
+    check_lock(memory, tmp_path)
+
+
+def test_a_lock_at_a_location_on_s3(s3: str, tmp_path: Path, quick_claims: None) -> None:
+    check_lock(f"{s3}/locks", tmp_path)
+
+
+def test_of_two_that_begin_at_once_the_last_to_write_has_it(
+    memory: str, tmp_path: Path, quick_claims: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a file cannot be created only if it is not there."""
+    there = other_machine(memory, tmp_path)
+    path = there.folder / ".improvo.lock"
+    monkeypatch.setattr(claim.Claim, "_created", lambda self: False)
+
+    def other_writes(seconds: float) -> None:
+        there.fs.pipe_file(there.remote(path), b'{"process": 8, "host": "far-away", "token": "b"}')
+
+    monkeypatch.setattr(claim.time, "sleep", other_writes)
+    with pytest.raises(claim.ClaimedError, match="far-away"):
+        claim.Claim(there, path, {"token": "a"}, lambda holder: False)
+
+
+def test_a_sequence_that_another_machine_labels_is_waited_for_and_taken(
+    memory: str, tmp_path: Path, quick_claims: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    walks = [write_walk(tmp_path / name, frames=16, seed=seed) for seed, name in enumerate(("attic", "hall"))]
+    network = FrontendSettings(name="orb", max_keypoints=200)
+    settings = LabelRunSettings(
+        frontend=network, labels=LabelSettings(min_observations=6, quality=LabelQualitySettings(enabled=False))
+    )
+    monkeypatch.setattr(label_module, "_POLL_SECONDS", 0.05)
+    (expected,) = label_module.label_sequences(walks[:1], tmp_path / "local", settings)
+    there = other_machine(memory, tmp_path)
+    mine = {"process": 7, "host": "far-away", "token": "a"}
+    held = claim.Claim(there, there.folder / ".attic.lock", mine, lambda holder: False)
+    waited: list[tuple[str, str]] = []
+
+    def on_wait(name: str, holder: str) -> None:
+        if not waited:
+            upload(tmp_path / "local" / "attic", f"{memory}/attic")
+            held.release()
+        waited.append((name, holder))
+
+    records = label_module.label_sequences(walks, local_folder(memory), settings, on_wait=on_wait)
+    assert waited == [("attic", "process 7 on far-away")]
+    assert [record.name for record in records] == ["attic", "hall"]
+    assert records[0].seconds == expected.seconds  # it was not labelled once more

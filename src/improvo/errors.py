@@ -1,6 +1,8 @@
 """The exceptions of improvo: one base, caught once by the command line. And whether an optional package is there."""
 
+from importlib import import_module
 from importlib.util import find_spec
+from typing import Any
 
 
 class ImprovoError(Exception):
@@ -35,9 +37,44 @@ class MissingExtraError(ImprovoError):
         super().__init__(f"{feature} needs an optional dependency: pip install 'improvo[{extra}]'")
 
 
+PLOTS_MISSING = "pip install 'improvo[plots]'"
+
+
+def plots_installed() -> bool:
+    """Whether curves and maps can be drawn."""
+    return installed("matplotlib")
+
+
+def require_plots(feature: str) -> None:
+    """Refuse what is drawn with matplotlib before any work is done.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    if not plots_installed():
+        raise MissingExtraError(feature, "plots")
+
+
 def installed(package: str) -> bool:
     """Whether a package can be imported; nothing is loaded."""
     try:
         return find_spec(package) is not None
     except ValueError:  # made unavailable by hand: None in sys.modules
         return False
+
+
+def imported(package: str, feature: str, extra: str) -> Any:
+    """An optional package.
+
+    Args:
+        package: its name.
+        feature: what needs it, as `MissingExtraError` says it.
+        extra: that brings it.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        return import_module(package)
+    except ImportError:
+        raise MissingExtraError(feature, extra) from None

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from improvo import locations
 from improvo.errors import InputError, OutputError
 from improvo.formats import FORMAT, FORMAT_KEY, check_format
+from improvo.locations.place import MARKER as MARKER  # of a folder that a command of ours has made
 from improvo.untrusted.paths import check_path
 from improvo.untrusted.text import load_json
 
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-MARKER = ".improvo.json"
 FORMER_NAME = "sivo"  # of this package; folders and weights written under it stay readable
 _TEMPORARY = re.compile(r"\..+\.(\d+)(?:-(\w+))?\.partial(?:\..*)?", re.DOTALL)  # see `temporary_name`
 _HOST = hashlib.sha256(socket.gethostname().encode()).hexdigest()[:6]

@@ -2,7 +2,8 @@
 
 The lock belongs to a process, not to the file. However a process ends, it no longer holds the lock. The system's own
 file locks say so at once. Where they do not reach (some shared file systems, between machines), a holder renews the
-time of its lock file, and one whose file does not change any more is dead.
+time of its lock file, and one whose file does not change any more is dead. A folder that stands for a location has such
+a file there, too (`improvo.locations.claim`).
 """
 
 from __future__ import annotations
@@ -18,8 +19,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from improvo import locations
 from improvo.errors import ImprovoError, OutputError
 from improvo.files import MARKER, make_output_folder, process_exists
+from improvo.locations.claim import ClaimedError
 
 LOCK = ".improvo.lock"
 _BEAT_SECONDS = 5.0
@@ -40,10 +43,10 @@ class BusyError(OutputError):
 
     def __init__(self, path: Path, holder: str) -> None:
         super().__init__(f"{path}: {holder} is at work there; wait until it ends, or choose another output folder")
-        self.holder = holder
+        self.path, self.holder = path, holder
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _busy_again, (str(self), self.holder)
+    def __reduce__(self) -> tuple[Any, ...]:  # pickle would give it the message alone
+        return BusyError, (self.path, self.holder)
 
 
 @contextmanager
@@ -57,6 +60,7 @@ def locked(folder: Path) -> Iterator[None]:
         BusyError: another process or thread is at work there; the message says which, and since when.
     """
     with claimed(folder / LOCK, folder):
+        locations.refresh(folder)  # what another machine has written to its location meanwhile
         yield
 
 
@@ -106,10 +110,12 @@ def claimed(file: Path, what: Path | None = None) -> Iterator[None]:
         return
     if holder is not None:
         raise BusyError(what, f"another thread of process {os.getpid()}")
+    mine = _this_process()
     try:
-        lock = _LockFile(file, what)
+        lock = _LockFile(file, what, mine)
         try:
-            yield
+            with _claimed_at_location(file, what, mine):
+                yield
         finally:
             lock.release()
     finally:
@@ -117,11 +123,25 @@ def claimed(file: Path, what: Path | None = None) -> Iterator[None]:
             del _held[place]
 
 
+@contextmanager
+def _claimed_at_location(file: Path, what: Path, mine: dict[str, Any]) -> Iterator[None]:
+    """Where the file is of a folder that stands for a location, nobody else holds it there within the block."""
+    try:
+        claim = locations.take_claim(file, mine, _is_dead_here)
+    except ClaimedError as error:
+        raise BusyError(what, _words(error.holder)) from None
+    try:
+        yield
+    finally:
+        if claim is not None:
+            claim.release()
+
+
 class _LockFile:
     """A lock that this process holds, from its making to `release`."""
 
-    def __init__(self, file: Path, what: Path) -> None:
-        self._file, self._what = file, what
+    def __init__(self, file: Path, what: Path, mine: dict[str, Any]) -> None:
+        self._file, self._what, self._mine = file, what, mine
         self._released = threading.Event()
         try:
             self._descriptor = self._opened()
@@ -163,15 +183,11 @@ class _LockFile:
         before = self._content()
         if before and not self._is_gone(before):
             raise BusyError(self._what, _words(before))
-        mine = json.dumps({
-            "process": os.getpid(), "host": socket.gethostname(), "since": time.strftime("%Y-%m-%d %H:%M:%S"),
-            "token": os.urandom(8).hex(),
-        })  # fmt: skip
         os.ftruncate(self._descriptor, 0)
-        os.pwrite(self._descriptor, mine.encode(), 0)
+        os.pwrite(self._descriptor, json.dumps(self._mine).encode(), 0)
         if not self._by_system:  # two that begin at once both come here; the last one to write has it
             time.sleep(1.0)
-            if (now := self._content()) != json.loads(mine):
+            if (now := self._content()) != self._mine:
                 raise BusyError(self._what, _words(now))
 
     def _content(self) -> dict[str, Any]:
@@ -201,6 +217,15 @@ class _LockFile:
 
 def seems_held(file: Path) -> bool:
     """Whether somebody holds a lock, said at once; a holder on another machine may have died since."""
+    return _seems_held_here(file) or _seems_held_at_location(file)
+
+
+def _seems_held_at_location(file: Path) -> bool:
+    holder = locations.claimant(file)
+    return holder is not None and not _is_dead_here(holder)
+
+
+def _seems_held_here(file: Path) -> bool:
     if file.resolve() in _held:
         return True
     try:
@@ -229,7 +254,7 @@ def holder_of(file: Path) -> str:
         with file.open("rb") as stream:
             found = _parsed(stream.read(_LONGEST))
     except OSError:
-        return ""
+        found = locations.claimant(file) or {}
     return _words(found) if found else ""
 
 
@@ -267,12 +292,17 @@ def _words(holder: dict[str, Any]) -> str:
     return f"{who} (since {holder['since']})" if holder.get("since") else who
 
 
+def _this_process() -> dict[str, Any]:
+    """As a lock file names it."""
+    since = time.strftime("%Y-%m-%d %H:%M:%S")
+    return {"process": os.getpid(), "host": socket.gethostname(), "since": since, "token": os.urandom(8).hex()}
+
+
+def _is_dead_here(holder: dict[str, Any]) -> bool:
+    """Whether the holder was a process of this machine, and has ended."""
+    return holder.get("host") == socket.gethostname() and not _is_running(holder.get("process"))
+
+
 def _is_running(process: object) -> bool:
     """Whether the holder that a file names lives; what is no number cannot be asked for."""
     return not isinstance(process, int) or process_exists(process)
-
-
-def _busy_again(message: str, holder: str) -> BusyError:
-    error = BusyError.__new__(BusyError)
-    error.args, error.holder = (message,), holder
-    return error

@@ -200,16 +200,14 @@ def train_odometry(
 
 
 def need_torch() -> None:
-    """Refuse to train without torch, before any work is done.
+    """Refuse to train without torch and SciPy, before any work is done.
 
     Raises:
-        MissingExtraError: it is not installed.
+        MissingExtraError: one of them is not installed.
     """
-    import importlib.util
+    from improvo.errors import MissingExtraError, installed
 
-    from improvo.errors import MissingExtraError
-
-    if importlib.util.find_spec("torch") is None:
+    if not (installed("torch") and installed("scipy")):
         raise MissingExtraError("training", "train")
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from improvo.errors import InputError
+from improvo.errors import InputError, require_plots
 from improvo.files import written_atomically
 from improvo.types import Float32, Float64, UInt8
 
@@ -116,7 +116,9 @@ def print_board(board: Board, path: Path, paper: str = "A4") -> None:
     Raises:
         InputError: it does not fit on the paper.
         OutputError: the file cannot be written.
+        MissingExtraError: matplotlib is not installed.
     """
+    require_plots("printing a board")
     from matplotlib.backends.backend_pdf import FigureCanvasPdf
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle

@@ -10,7 +10,7 @@ import argparse
 from pathlib import Path
 
 from improvo.cli.options import folder_path, read_folder_path, recording_path
-from improvo.errors import MissingExtraError
+from improvo.errors import imported
 
 _SHELLS = ("bash", "zsh", "fish")
 _OF_FILES = (Path, recording_path, folder_path, read_folder_path)  # types of arguments that are paths
@@ -29,10 +29,7 @@ def run(arguments: argparse.Namespace) -> None:
     """
     from improvo.cli.main import whole_parser
 
-    try:
-        import shtab
-    except ImportError:
-        raise MissingExtraError("printing a completion script", "completion") from None
+    shtab = imported("shtab", "printing a completion script", "completion")
     parser = whole_parser()
     _mark_files(parser, shtab.FILE)
     print(shtab.complete(parser, arguments.shell))

@@ -18,7 +18,7 @@ from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.evaluate_options import add_frontend_arguments, add_run_arguments, add_truth_argument
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import figures, next_after_figures, say
-from improvo.errors import ConfigError, ImprovoError, InputError
+from improvo.errors import PLOTS_MISSING, ConfigError, ImprovoError, InputError, plots_installed
 from improvo.evaluation.settings import ESTIMATORS, USUAL_OVERLAPS, PoseCommandSettings, PoseSettings
 from improvo.geometry.depth_sampling import SAMPLINGS
 from improvo.untrusted.text import read_json_file
@@ -257,6 +257,9 @@ def _write_text(results: dict[str, Any], output: Path) -> None:
 def _draw(results: dict[str, Any], output: Path) -> None:
     from improvo.evaluation.plots import draw_pose_curves
 
+    if not plots_installed():
+        say(f"without pictures of curves; {PLOTS_MISSING} draws them")
+        return
     for estimator in results["settings"]["estimators"]:
         draw_pose_curves(results, estimator, output / f"curves-{estimator}.png")
 

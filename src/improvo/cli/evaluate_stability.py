@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from improvo.cli.output import figures, next_after_figures
+from improvo.cli.output import figures, next_after_figures, say
 
 COMMAND = "evaluate stability"
 
@@ -60,11 +60,15 @@ def run(arguments: argparse.Namespace) -> int:
     text = stability_table(results)
     figures(results, text)
     if arguments.output is not None:
+        from improvo.errors import PLOTS_MISSING, plots_installed
         from improvo.evaluation.stability.plot import draw_stability
 
         make_output_folder(arguments.output, COMMAND)
         write_json(arguments.output / "stability.json", results)
         write_text(arguments.output / "stability.md", text)
-        draw_stability(scored, results, arguments.output / "stability.png")
+        if plots_installed():
+            draw_stability(scored, results, arguments.output / "stability.png")
+        else:
+            say(f"without stability.png; {PLOTS_MISSING} draws it")
     next_after_figures(arguments.output)
     return 0

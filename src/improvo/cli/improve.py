@@ -27,7 +27,7 @@ from improvo.cli.train_options import add_data_card, read_data_card
 from improvo.errors import ConfigError
 from improvo.files import check_output_folder
 from improvo.frontend.registry import check_frontend
-from improvo.improvement.settings import RECIPES, ImproveSettings
+from improvo.improvement.settings import METRIC, RECIPES, ImproveSettings
 from improvo.verbs import need_torch
 
 
@@ -93,6 +93,8 @@ def _of_both_recipes(arguments: argparse.Namespace) -> list[str]:
         if hasattr(arguments, name):
             extra += [f"{recipe}.optimiser.{name}={getattr(arguments, name)}" for recipe in ("held", "training")]
     if hasattr(arguments, "steps"):
+        if getattr(arguments, "recipe", "") == METRIC:
+            raise ConfigError("--steps: the recipe `metric` makes none; --set metric.pairs=N is how much it looks at")
         extra.append("steps_per_frame=0")
         extra += [f"{recipe}.optimiser.decay_steps={arguments.steps // 3}" for recipe in ("held", "training")]
         if arguments.steps < 1:

@@ -27,6 +27,7 @@ _OPENCV_PACKAGES = (
     *("opencv-contrib-python", "opencv-contrib-python-headless"),
 )
 _NO_MEMORY = "out of memory; give it more, or smaller pictures (--width), fewer keypoints or fewer --workers"
+_NO_FOLDER = "the folder that it runs in was removed; change to another one (cd) and run it again"
 _WORDS_OF_NO_MEMORY = ("insufficient memory", "can't allocate memory", "out of memory", "bad_alloc", "start new thread")
 
 
@@ -75,9 +76,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
-        if not _out_of_memory(error):
+        said = _NO_MEMORY if _out_of_memory(error) else _NO_FOLDER if _folder_is_gone(error) else ""
+        if not said:
             raise
-        print(f"improvo: {_NO_MEMORY}", file=sys.stderr)
+        print(f"improvo: {said}", file=sys.stderr)
         return 2
 
 
@@ -97,6 +99,17 @@ def _say_if_opencv_is_there_twice() -> None:
 def _out_of_memory(error: Exception) -> bool:
     """Whether this is how Python, NumPy, OpenCV, torch or OpenVINO say so."""
     return isinstance(error, MemoryError) or any(words in str(error).lower() for words in _WORDS_OF_NO_MEMORY)
+
+
+def _folder_is_gone(error: Exception) -> bool:
+    """Whether the folder that the command runs in was removed; every path that is relative to it fails then."""
+    if not isinstance(error, FileNotFoundError):
+        return False
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _check_paths(arguments: argparse.Namespace) -> None:

@@ -65,11 +65,16 @@ def say_improve_plan(plan: ImprovePlan, rounds: int) -> None:
     )
     times = ", ".join(f"{n}: {duration(plan.labelings * once.seconds(n))}" for n in useful_workers(once))
     say(f"its time by the number of workers, each with a free core: {times}")
+    minutes, where = duration(60 * needed.other_minutes), "of one core"
+    if not plan.measured:
+        where = "on two calm cores (not measured here, within a factor of two)"
     say(
-        f"depth, training and validation: about {duration(60 * needed.other_minutes)} on two calm cores (not measured "
-        f"here, within a factor of two), {size(needed.memory_mib)} of memory; {size(needed.disk_mib)} of disk in all"
+        f"depth, training and validation: about {minutes} {where}, {size(needed.memory_mib)} of memory; "
+        f"{size(needed.disk_mib)} of disk in all"
     )
-    figures({"labelling": values, "labelings": plan.labelings, "others": asdict(needed)}, "")
+    figures(
+        {"labelling": values, "labelings": plan.labelings, "others": {**asdict(needed), "measured": plan.measured}}, ""
+    )
 
 
 def duration(seconds: float) -> str:

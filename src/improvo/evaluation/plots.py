@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from improvo.errors import require_plots
 from improvo.files import written_atomically
 
 # Okabe and Ito's colours, told apart by colour-blind readers and in print; then line styles repeat them.
@@ -19,7 +20,11 @@ def draw_pose_curves(results: dict[str, Any], estimator: str, path: Path) -> Non
         results: content of `pose.json`.
         estimator: the solver.
         path: PNG to write.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
     """
+    require_plots("pictures of curves")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from improvo.errors import MissingExtraError
+from improvo.errors import imported
 from improvo.export.features import MatchedFrame
 from improvo.files import write_text, written_atomically
 from improvo.geometry.camera import Camera
@@ -37,11 +37,7 @@ def check_h5py() -> Any:
     Raises:
         MissingExtraError: it is not installed.
     """
-    try:
-        import h5py
-    except ImportError:
-        raise MissingExtraError("writing hloc's HDF5 files", "hdf5") from None
-    return h5py
+    return imported("h5py", "writing hloc's HDF5 files", "hdf5")
 
 
 def write_hloc(frames: Iterable[MatchedFrame], camera: Camera, folder: Path, descriptors: str) -> Written:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from improvo import config, files
-from improvo.errors import InputError, MissingExtraError, OutputError
+from improvo.errors import InputError, OutputError, imported
 from improvo.frontend.architecture import Architecture
 from improvo.frontend.channel_pruning import with_dead_channels
 from improvo.frontend.importing import LAYOUTS, Layout
@@ -199,9 +199,6 @@ def _write_tensors(path: Path, tensors: Tensors, metadata: dict[str, str]) -> No
         with files.written_atomically(path) as temporary:
             temporary.write_bytes(save(kept, metadata=metadata))
         return
-    try:
-        import torch
-    except ImportError:
-        raise MissingExtraError("writing .pth, unlike .safetensors,", "train") from None
+    torch = imported("torch", "writing .pth, unlike .safetensors,", "train")
     with files.written_atomically(path) as temporary:
         torch.save({name: torch.from_numpy(values.copy()) for name, values in kept.items()}, temporary)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit
 
 from improvo.frontend.architecture import CELL
 from improvo.frontend.masking import unmasked
@@ -95,7 +94,8 @@ def sample_descriptors(cells: Float32, keypoints: Float32) -> Float32:
 
 def stability_probability(logits: Float32) -> Float32:
     """Softmax over the last axis (..., 2): the probability of the second class, "stable"."""
-    return np.asarray(expit(logits[..., 1] - logits[..., 0]), np.float32)
+    with np.errstate(over="ignore"):  # 1 / (1 + inf) is right
+        return np.asarray(1.0 / (1.0 + np.exp(logits[..., 0] - logits[..., 1])), np.float32)
 
 
 def stability_map(logits: Float32, height: int, width: int) -> Float32:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from improvo.errors import ConfigError, InputError, MissingExtraError
+from improvo.errors import ConfigError, InputError, MissingExtraError, imported
 from improvo.frontend.architecture import Architecture, Normalisation
 from improvo.frontend.weights import ModelCard, Weights
 from improvo.types import Float32, Float64
@@ -91,10 +91,7 @@ def read_public_file(path: Path) -> dict[str, NDArray[Any]]:
 
             check_array("tensors", (path.stat().st_size,), 1, MAX_WEIGHTS_BYTES)
             return dict(load_file(path))
-        try:
-            import torch
-        except ImportError:
-            raise MissingExtraError("reading a torch file", "train") from None
+        torch = imported("torch", "reading a torch file", "train")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of pickle protocols, when the file is no torch file at all
             _check_torch_file(path)

@@ -23,14 +23,7 @@ _ERRORS_ONLY = 3  # severity of its log
 
 
 class OnnxRuntime:
-    """Runs a network on the CPU with ONNX Runtime; several threads may call it.
-
-    Args:
-        weights: of any architecture.
-        int8: compute all but the detector's and the stability head's last layer in eight bits, by the activation
-            ranges of the model card.
-        threads: 0 for as many as the machine has.
-    """
+    """Runs a network on the CPU with ONNX Runtime; arguments as `OpenVinoRuntime`. Several threads may call it."""
 
     def __init__(self, weights: Weights, int8: bool = False, threads: int = 0) -> None:
         self.name = "onnxruntime-int8" if int8 else "onnxruntime-float32"

@@ -33,7 +33,12 @@ def rotation_residuals(camera: Camera, pixels_a: Float64, pixels_b: Float64) -> 
 
 
 def sampson_errors(b_from_a: Float64, camera: Camera, pixels_a: Float64, pixels_b: Float64) -> Float64:
-    """Sampson distance in pixels (N,) of matches to a relative pose.
+    """Sampson distance in pixels (N,) of matches to a relative pose; arguments as `signed_sampson_errors`."""
+    return np.abs(signed_sampson_errors(b_from_a, camera, pixels_a, pixels_b))
+
+
+def signed_sampson_errors(b_from_a: Float64, camera: Camera, pixels_a: Float64, pixels_b: Float64) -> Float64:
+    """Sampson distance in pixels (N,) of matches to a relative pose, with the sign of the epipolar equation.
 
     Args:
         b_from_a: (4, 4).
@@ -48,7 +53,7 @@ def sampson_errors(b_from_a: Float64, camera: Camera, pixels_a: Float64, pixels_
     algebraic = (rays_b * lines_b).sum(axis=1)
     slope = (lines_b[:, :2] ** 2).sum(axis=1) + (lines_a[:, :2] ** 2).sum(axis=1)
     focal = np.sqrt(camera.fx * camera.fy)
-    return focal * np.abs(algebraic) / np.sqrt(np.maximum(slope, 1e-18))
+    return focal * algebraic / np.sqrt(np.maximum(slope, 1e-18))
 
 
 def half_line_distances(b_from_a: Float64, camera: Camera, pixels_a: Float64, pixels_b: Float64) -> Float64:

@@ -6,6 +6,7 @@ start of a map depends on a good one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -14,13 +15,14 @@ from numpy.typing import NDArray
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.geometry.epipolar import in_front_of_both, sampson_errors
+from improvo.geometry.epipolar import in_front_of_both, sampson_errors, signed_sampson_errors
 from improvo.geometry.ransac import Ransac, RobustHomography, RobustPose
 from improvo.types import Float64
 
 _MAX_ITERATIONS = 10_000  # where the caller names none; as PoseLib, USAC stops before when it is sure
 _CONFIDENCE = 0.9999  # as PoseLib's
 _MIN_LENGTH = 1e-6  # of the translation over the distance of a plane; a homography with less is a rotation
+_POLISHING_STEPS, _DIFFERENCE = 5, 1e-7  # of the angles (radians) and the direction, for derivatives
 _POLISH_ROUNDS = 2  # polishing moves the threshold's edge, and with it the inliers
 
 
@@ -144,9 +146,28 @@ def _agreeing(
 
 
 def _polished(b_from_a: Float64, camera: Camera, pixels_a: Float64, pixels_b: Float64, scale: float) -> Float64:
-    """The motion nearby with least Sampson distance: three angles, and two for the direction of the translation."""
-    from scipy.optimize import least_squares
+    """The motion nearby with least Sampson distance: three angles, and two for the direction of the translation.
 
+    Gauss and Newton's method with differences for derivatives, under the loss 2 (sqrt(1 + z) - 1), z = (2 e / scale)².
+    """
+    motion = b_from_a
+    errors = signed_sampson_errors(motion, camera, pixels_a, pixels_b) / (0.5 * scale)
+    for _ in range(_POLISHING_STEPS):
+        moved = _motions_around(motion)
+        beside = [signed_sampson_errors(moved(one), camera, pixels_a, pixels_b) for one in _DIFFERENCE * np.eye(5)]
+        slopes = (np.stack(beside, axis=1) / (0.5 * scale) - errors[:, None]) / _DIFFERENCE
+        roots = (1.0 + errors**2) ** -0.25  # of the weights of the observations
+        step = np.linalg.lstsq(roots[:, None] * slopes, -roots * errors, rcond=None)[0]
+        candidate = moved(np.asarray(step, np.float64))
+        its_errors = signed_sampson_errors(candidate, camera, pixels_a, pixels_b) / (0.5 * scale)
+        if not np.sqrt(1.0 + its_errors**2).sum() < np.sqrt(1.0 + errors**2).sum():
+            break
+        motion, errors = candidate, its_errors
+    return motion
+
+
+def _motions_around(b_from_a: Float64) -> Callable[[Float64], Float64]:
+    """From three angles and two steps of the direction of the translation (5,) to a motion near this one."""
     rotation, direction = b_from_a[:3, :3], b_from_a[:3, 3]
     across = np.linalg.svd(direction[None])[2][1:]  # (2, 3) an orthonormal basis beside the direction
 
@@ -154,14 +175,7 @@ def _polished(b_from_a: Float64, camera: Camera, pixels_a: Float64, pixels_b: Fl
         move = direction + step[3:] @ across
         return se3.rigid(se3.so3_exp(step[:3]) @ rotation, move / np.linalg.norm(move))
 
-    found = least_squares(
-        lambda step: sampson_errors(moved(step), camera, pixels_a, pixels_b),
-        np.zeros(5),
-        loss="soft_l1",
-        f_scale=0.5 * scale,
-        max_nfev=10,
-    )
-    return moved(found.x)
+    return moved
 
 
 SOLVER = OpenCvSolver()

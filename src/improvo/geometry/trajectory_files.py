@@ -20,6 +20,7 @@ from improvo.geometry.se3 import quat_xyzw_from_rotation, rigid, rotation_from_q
 from improvo.geometry.text_files import read_text
 from improvo.geometry.time_units import in_seconds
 from improvo.types import Float64, Int64, Trajectory
+from improvo.untrusted.text import is_number
 
 RIGID_TOLERANCE = 1e-2
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
@@ -189,7 +190,7 @@ def _rows(lines: list[str], columns: int) -> tuple[Float64, Int64, Int64, Int64]
         except ValueError:
             row = []
         if len(row) < columns:
-            if values or malformed or any(_is_number(field) for field in fields):  # else the names of the columns
+            if values or malformed or any(is_number(field) for field in fields):  # else the names of the columns
                 malformed.append(number)
             continue
         values.append(row)
@@ -214,7 +215,7 @@ def _guess(lines: list[str], path: Path) -> str:
     for line in lines:
         text = line.strip()
         fields = split_numbers(text)
-        if not fields or text.startswith("#") or not _is_number(fields[0]):
+        if not fields or text.startswith("#") or not is_number(fields[0]):
             continue
         if len(fields) == 12:
             return "kitti"
@@ -231,21 +232,13 @@ def _quaternion_order(lines: list[str]) -> str | None:
     """`wxyz` or `xyzw` as the names of the columns say it; None where they say nothing."""
     for line in lines:
         fields = [field for field in re.split(r"[\s,;#]+", line.lower()) if field and not field.startswith("[")]
-        if fields and _is_number(fields[0]):
+        if fields and is_number(fields[0]):
             return None
         matches = [re.fullmatch(r"(?:q|quat|rot|orientation)\w*?([wxyz])(?:\[\])?", field) for field in fields]
         order = "".join(match.group(1) for match in matches if match is not None)
         if order in ("wxyz", "xyzw"):
             return order
     return None
-
-
-def _is_number(field: str) -> bool:
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return True
 
 
 def _from_quaternions(quat_xyzw: Float64, translation: Float64) -> Float64:
@@ -296,7 +289,7 @@ def read_times(path: Path) -> tuple[Float64, tuple[str, ...]]:
         whole = [float(row[0]) for row in rows]
         if any(b <= a for a, b in pairwise(whole)):  # decimal commas: alone, the part before them does not increase
             rows = [[line.replace(",", ".")] for line in lines]
-    if rows and not _is_number(rows[0][0]) and not _DATE.match(rows[0][0]):
+    if rows and not is_number(rows[0][0]) and not _DATE.match(rows[0][0]):
         rows = rows[1:]  # the names of the columns
     try:
         if rows and all(len(row) > 1 and _DATE.fullmatch(row[0]) for row in rows):
@@ -314,7 +307,7 @@ def read_times(path: Path) -> tuple[Float64, tuple[str, ...]]:
 
 def _counts(rows: list[list[str]]) -> bool:
     """Whether the first column only numbers the rows, and the second has the times."""
-    if len(rows) < 2 or not all(len(row) > 1 and row[0].isdecimal() and _is_number(row[1]) for row in rows):
+    if len(rows) < 2 or not all(len(row) > 1 and row[0].isdecimal() and is_number(row[1]) for row in rows):
         return False
     numbers, second = (np.array([float(row[column]) for row in rows]) for column in (0, 1))
     return bool((np.diff(numbers) == 1).all() and (np.diff(second) > 0).all())

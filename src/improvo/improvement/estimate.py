@@ -9,22 +9,43 @@ from pathlib import Path
 
 from improvo.errors import OutputError
 from improvo.improvement.recipe import steps_of
-from improvo.improvement.settings import HELD, ImproveSettings
+from improvo.improvement.settings import HELD, METRIC, TRACKS, ImproveSettings
 from improvo.terminal import counted
 
 # seconds on two calm cores with `superpoint-small`; `superpoint` takes about four times as long where it trains
 _SECONDS_PER_FRAME = 0.12  # of odometry, at 640x480
 _SECONDS_PER_DEPTH = 0.35
-_SECONDS_PER_STEP = 0.35  # one core of an AMD EPYC with AVX-512 BF16, 2026-11-28; in float32 two to three times as long
+_SECONDS_PER_STEP = 0.2  # one core of an AMD EPYC with AVX-512 BF16, 2026-11-28; in float32 two to three times as long
+_MIB_PER_REMEMBERED = 2.1  # frame of 640x480, with what is held to
 _SECONDS_PER_PAIR = 0.08
+_GAPS = 3  # between the frames of a pair
+_SECONDS_PER_FRAME_PAIR = 0.02  # of the recipe `metric`, beside the features of its frames
 _LARGER = 4.0  # times as long for a step of the full network
 _MIB = 2**20
 _TORCH_MIB = 900  # of a process that trains
 
 
 @dataclass(frozen=True)
+class Costs:
+    """Seconds of the parts of the loop."""
+
+    frame: float  # of odometry
+    depth: float  # of a depth map
+    step: float  # of training
+    pair: float  # that a candidate is measured on
+    start: float = 0.0  # of a training, before its first step
+
+    @classmethod
+    def usual(cls, pixels: int, parameters: int) -> Costs:
+        """On two calm cores, by the pixels of a frame and the parameters of the network."""
+        size = pixels / (640 * 480)
+        step = _SECONDS_PER_STEP * (_LARGER if parameters > 1_000_000 else 1.0)
+        return cls(_SECONDS_PER_FRAME * size, _SECONDS_PER_DEPTH * size, step, _SECONDS_PER_PAIR)
+
+
+@dataclass(frozen=True)
 class Estimate:
-    """Roughly what is needed, within a factor of two."""
+    """Roughly what is needed; with the usual costs, within a factor of two."""
 
     minutes: float
     memory_mib: float
@@ -49,7 +70,13 @@ def _size(mib: float) -> str:
 
 
 def estimate(
-    settings: ImproveSettings, rounds: int, training: int, held_back: int, pixels: int, parameters: int
+    settings: ImproveSettings,
+    rounds: int,
+    training: int,
+    held_back: int,
+    pixels: int,
+    costs: Costs,
+    recordings: int = 0,
 ) -> Estimate:
     """Estimate all of the loop.
 
@@ -58,23 +85,31 @@ def estimate(
         rounds: to come.
         training, held_back: frames of the two parts.
         pixels: of a frame.
-        parameters: of the network.
+        costs: of its parts.
+        recordings: that are held back as a whole; 0 where a part of the only one is.
     """
-    size = pixels / (640 * 480)
     reference = settings.reference
     deep = min(training, reference.most_training) + min(held_back, reference.most_held_back)
     steps = steps_of(settings, training)
     trainings = rounds + settings.control
-    step = _SECONDS_PER_STEP * (_LARGER if parameters > 1_000_000 else 1.0)
-    each = 60 * settings.minutes if settings.minutes else steps * step
-    validation = 0.12 * size * held_back * 2 + 3 * settings.validation.matches.pairs * _SECONDS_PER_PAIR
-    frames = (2 if settings.recipe == HELD else 1) * (training + held_back) + (rounds - 1) * training
-    others = deep * _SECONDS_PER_DEPTH * size + trainings * each + (1 + trainings) * validation
-    seconds = frames * _SECONDS_PER_FRAME * size + others
+    each = costs.start + (60 * settings.minutes if settings.minutes else steps * costs.step)
+    if settings.recipe == METRIC:
+        each = training * costs.frame + steps * _SECONDS_PER_FRAME_PAIR
+    # of a whole recording the reference has the labels of the start already
+    labeled = training if settings.teaches_labels else 0
+    again = 0 if settings.recipe == TRACKS or recordings else labeled + held_back
+    frames = training + held_back + again + (rounds - 1) * labeled + trainings * held_back
+    pairs = max(recordings, 1) * min(settings.validation.matches.pairs, held_back // max(recordings, 1))
+    validations = (1 + trainings) * pairs * _GAPS * costs.pair
+    others = deep * costs.depth + trainings * each + validations
     small = min(pixels, settings.held.longer_side**2 * 3 // 4)
-    memory = _TORCH_MIB + min(training, reference.most_training) * (2.5 * small + 4 * pixels / 4) / _MIB
+    taught = min(training, reference.most_training)
+    memory = _TORCH_MIB + taught * (2.5 * small + 4 * pixels / 4) / _MIB
+    if settings.recipe == HELD and settings.held.pairs.whole_frames:
+        remembered = min(taught, settings.held.pairs.frames_remembered)
+        memory += remembered * _MIB_PER_REMEMBERED * small / (640 * 480)
     disk = 60 + 0.1 * (training + held_back) * (1 + trainings) + deep * pixels / 4 * 1.3 / _MIB + 12 * trainings
-    return Estimate(seconds / 60, memory, disk, steps, frames, others / 60)
+    return Estimate((frames * costs.frame + others) / 60, memory, disk, steps, frames, others / 60)
 
 
 def refuse_full_disk(folder: Path, needed: Estimate) -> None:

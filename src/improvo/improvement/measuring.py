@@ -61,8 +61,8 @@ def validate(
         InputError: no pair of frames has poses and depth.
     """
     started = time.perf_counter()
-    jobs = [_ScoreJob(one, candidate.weights, settings) for one in reference]
-    scores = [entry for found in crew.results(_scores_of, jobs, tick) for entry in found]
+    jobs = [ScoreJob(one, candidate.weights, settings) for one in reference]
+    scores = [entry for found in crew.results(scores_of, jobs, tick) for entry in found]
     if all(entry.earlier for entry in scores):
         raise InputError(
             "what is held back has no pair of frames with poses and depth; hold back a longer or livelier recording "
@@ -96,7 +96,7 @@ def pairs_of(run: FixedRun, settings: ValidationSettings) -> list[Int64]:
 
 
 @dataclass(frozen=True)
-class _ScoreJob:
+class ScoreJob:
     """A recording to measure a frontend on."""
 
     reference: ReferencePart
@@ -104,7 +104,8 @@ class _ScoreJob:
     settings: ValidationSettings
 
 
-def _scores_of(job: _ScoreJob, tick: Callable[[], None]) -> list[GapScores]:
+def scores_of(job: ScoreJob, tick: Callable[[], None]) -> list[GapScores]:
+    """Of the pairs of one recording, gap by gap; `tick` is called after every pair."""
     frontend = _loaded(job.weights, job.settings.matches.max_keypoints, job.weights.stat().st_mtime_ns)
     return _scores(job.reference, frontend, job.settings, tick)
 

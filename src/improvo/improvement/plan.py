@@ -1,7 +1,8 @@
-"""What the loop will cost: its labelling measured on a sample, the rest by the figures of `estimate`."""
+"""What the loop will cost: its parts measured on a sample, or where there is no torch, by the figures of `estimate`."""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -9,7 +10,8 @@ from pathlib import Path
 
 from improvo.errors import InputError
 from improvo.frontend.weights import load_weights
-from improvo.improvement.estimate import Estimate, estimate
+from improvo.improvement.estimate import Costs, Estimate, estimate
+from improvo.improvement.plan_sample import measure
 from improvo.improvement.rounds import starting_weights
 from improvo.improvement.settings import ImproveSettings
 from improvo.labeling.plan import LabelPlan, plan_labels
@@ -22,6 +24,7 @@ class ImprovePlan:
 
     once: LabelPlan  # all recordings labelled once, by the frontend at the start
     needed: Estimate
+    measured: bool  # whether depth, training and validation are, on this machine; then their minutes are of one core
 
     @property
     def labelings(self) -> float:
@@ -48,11 +51,18 @@ def plan_improvement(
     weights = starting_weights(settings.frontend.name)
     frontend = replace(settings.frontend, name=str(weights))
     paths = list(dict.fromkeys([*sequences, *evaluate]))
-    once = plan_labels(paths, settings.run_settings(settings.sequence, frontend), on_frames=on_frames)
-    held_back = round(once.frames * (len(evaluate) / len(paths) if evaluate else settings.split.share))
     pixels = _pixels(paths, settings)
-    parameters = sum(tensor.size for tensor in load_weights(weights).tensors.values())
-    return ImprovePlan(once, estimate(settings, rounds, once.frames - held_back, held_back, pixels, parameters))
+    with tempfile.TemporaryDirectory(prefix="improvo-plan-") as folder:
+        store = Path(folder) / "labels"
+        run_settings = settings.run_settings(settings.sequence, frontend)
+        once = plan_labels(paths, run_settings, on_frames=on_frames, folder=store)
+        costs = Costs.usual(pixels, _parameters(weights))
+        measured = measure(store, weights, settings, replace(costs, frame=once.frame_seconds))
+    held_back = round(once.frames * (len(evaluate) / len(paths) if evaluate else settings.split.share))
+    whole = len(evaluate) or (max(round(len(paths) * settings.split.share), 1) if len(paths) > 1 else 0)
+    training = once.frames - held_back
+    needed = estimate(settings, rounds, training, held_back, pixels, measured or costs, whole)
+    return ImprovePlan(once, needed, measured is not None)
 
 
 def first_estimate(
@@ -79,8 +89,14 @@ def first_estimate(
     if training + held_back == 0:
         return None
     paths = [*sequences, *evaluate]
-    parameters = sum(tensor.size for tensor in load_weights(starting_weights(settings.frontend.name)).tensors.values())
-    return estimate(settings, rounds, training, held_back, _pixels(paths, settings), parameters)
+    pixels = _pixels(paths, settings)
+    costs = Costs.usual(pixels, _parameters(starting_weights(settings.frontend.name)))
+    whole = len(evaluate) or (max(round(len(paths) * settings.split.share), 1) if len(paths) > 1 else 0)
+    return estimate(settings, rounds, training, held_back, pixels, costs, whole)
+
+
+def _parameters(weights: Path) -> int:
+    return sum(tensor.size for tensor in load_weights(weights).tensors.values())
 
 
 def _pixels(paths: Sequence[Path], settings: ImproveSettings) -> int:

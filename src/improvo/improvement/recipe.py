@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from improvo.improvement.reference import ReferencePart
-from improvo.improvement.settings import HELD, ImproveSettings
+from improvo.improvement.settings import HELD, METRIC, ImproveSettings
 from improvo.labeling.store import DONE, read_records
 
 if TYPE_CHECKING:
@@ -41,7 +41,8 @@ Train = Callable[[TrainingJob], dict[str, Any]]
 
 def train(job: TrainingJob) -> dict[str, Any]:
     """Train as the recipe says; the last row of metrics."""
-    return _train_held(job) if job.settings.recipe == HELD else _train_tracks(job)
+    recipes = {HELD: _train_held, METRIC: _train_metric}
+    return recipes.get(job.settings.recipe, _train_tracks)(job)
 
 
 def steps_of(settings: ImproveSettings, frames: int) -> int:
@@ -51,6 +52,8 @@ def steps_of(settings: ImproveSettings, frames: int) -> int:
         settings: of the loop.
         frames: of the training part.
     """
+    if settings.recipe == METRIC:
+        return settings.metric.pairs
     if settings.recipe != HELD:
         return settings.training.optimiser.steps
     most = settings.held.optimiser.steps
@@ -63,10 +66,7 @@ def _train_held(job: TrainingJob) -> dict[str, Any]:
     from improvo.training.pictures import Pictures, Source
 
     settings = job.settings.held
-    new = [entry for part in job.reference if not part.earlier for entry in part.teaching_frames(settings.longer_side)]
-    replayed = [entry for part in job.reference if part.earlier for entry in part.teaching_frames(settings.longer_side)]
-    weight = min(len(new) / len(replayed), 1.0) if replayed else 1.0  # at most every second pair is replayed
-    posed = [*new, *(replace(entry, weight=weight) for entry in replayed)]
+    posed = _teaching(job, settings.longer_side)
     sources = [_source(entry, Source) for entry in posed]
     steps = job.steps or steps_of(job.settings, sum(len(part.frames) for part in job.reference if not part.earlier))
     optimiser = replace(settings.optimiser, steps=steps, seed=job.seed)
@@ -84,6 +84,22 @@ def _train_held(job: TrainingJob) -> dict[str, Any]:
         0.0 if job.control else 60 * job.settings.minutes,
         () if job.control or not _has_labels(job.labels) else (job.labels,),
     )
+
+
+def _train_metric(job: TrainingJob) -> dict[str, Any]:
+    from improvo.training.metric_training import train_metric
+
+    settings = job.settings.metric
+    settings = replace(settings, seed=job.seed, two_frames=settings.two_frames and not job.control)
+    return train_metric(_teaching(job, settings.longer_side), settings, job.output, job.start, job.data)
+
+
+def _teaching(job: TrainingJob, longer_side: int) -> list[PosedSequence]:
+    """The frames of the reference with depth; of an earlier run's at most every second pair is replayed."""
+    new = [entry for part in job.reference if not part.earlier for entry in part.teaching_frames(longer_side)]
+    replayed = [entry for part in job.reference if part.earlier for entry in part.teaching_frames(longer_side)]
+    weight = min(len(new) / len(replayed), 1.0) if replayed else 1.0
+    return [*new, *(replace(entry, weight=weight) for entry in replayed)]
 
 
 def _has_labels(store: Path) -> bool:

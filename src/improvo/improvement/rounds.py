@@ -27,7 +27,7 @@ from improvo.improvement.reference import (
     reference_parts,
     refuse_without_depth,
 )
-from improvo.improvement.settings import HELD, ImproveSettings
+from improvo.improvement.settings import TRACKS, ImproveSettings
 from improvo.improvement.split import (
     Part,
     Split,
@@ -143,7 +143,7 @@ class Rounds:
         try:
             return self._label(teacher, list(part.paths), part.sequence, teacher.labels, "training part")
         except InputError:  # dense pairs teach without labels
-            if self._settings.recipe != HELD:
+            if self._settings.recipe == TRACKS:
                 raise
             return _refuse_unwritten(read_records(teacher.labels))
 
@@ -170,7 +170,7 @@ class Rounds:
             return
         candidate.folder.mkdir(exist_ok=True)
         settings = self._settings
-        seed = (settings.held if settings.recipe == HELD else settings.training).optimiser.seed
+        seed = (settings.training if settings.recipe == TRACKS else settings.held).optimiser.seed
         job = TrainingJob(
             settings,
             seed + number - 1,  # another try from the same weights and labels must not be the same try
@@ -194,7 +194,7 @@ class Rounds:
     def _trains_there(self) -> bool:
         """Whether the GPU is on the cluster, and not here."""
         settings = self._settings
-        device = (settings.held if settings.recipe == HELD else settings.training).optimiser.device
+        device = (settings.training if settings.recipe == TRACKS else settings.held).optimiser.device
         if self._crew.ray is None or device == "cpu":
             return False
         import torch

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from improvo.errors import InputError, MissingExtraError
+from improvo.errors import InputError, imported
 from improvo.jobs.processes import Job, Result, Tick
 from improvo.jobs.workers import ONE_THREAD, POLL_SECONDS, WorkerDiedError, with_errors_sent
 
@@ -90,11 +90,7 @@ def gpus_of(address: str) -> int:
 
 
 def _imported() -> Any:
-    try:
-        import ray
-    except ImportError:
-        raise MissingExtraError("work on a Ray cluster", "ray") from None
-    return ray
+    return imported("ray", "work on a Ray cluster", "ray")
 
 
 class _Counter:

@@ -22,6 +22,7 @@ from improvo.labeling.labeler import run_and_label
 from improvo.labeling.store import (
     DONE,
     FAILED,
+    RECORD_FILE,
     LabelStore,
     SequenceRecord,
     finish_sequence,
@@ -29,7 +30,7 @@ from improvo.labeling.store import (
     lock_of,
     sequence_names,
 )
-from improvo.locations import folder_here, refresh, url_of
+from improvo.locations import LOCATION_ERRORS, folder_here, lock_files, looked_up, refresh, url_of
 from improvo.odometry.run_settings import RunSettings
 
 logger = logging.getLogger(__name__)
@@ -101,10 +102,10 @@ def label_sequences(
     Raises:
         InputError: none of them could be labelled, or there is no Ray cluster.
         MissingExtraError: Ray is not installed.
-        OutputError, ConfigError: the store cannot be used, see `LabelStore`.
+        OutputError, ConfigError: the store cannot be used, see `LabelStore`, or its location does not answer any more.
     """
     names = sequence_names(list(paths))
-    store = LabelStore(folder, _fingerprint(settings, pack), relabel, type(settings))
+    store = LabelStore(folder, fingerprint(settings, pack), relabel, type(settings))
     before = {record.name: record for record in store.records() if record.state == DONE}
     records = {name: before[name] for name in names if name in before}
     for name, record in records.items():
@@ -125,15 +126,18 @@ def label_sequences(
                 elsewhere.append(job)
                 on_wait(job.name, result.holder)
                 return
+            if isinstance(result, LOCATION_ERRORS):  # of no use to label on
+                raise result
             records[job.name] = _stored(store, job, result)
             on_record(records[job.name])
 
         crew.do(label_sequence, jobs, on_result, on_frames, gpus)
         return elsewhere
 
+    taken = set(lock_files(store.folder))  # by other machines; the others first
+    jobs.sort(key=lambda job: job.lock in taken)
     crew = Crew(workers, ray)
     gpus = int(ray is not None and settings.frontend.network.device == "cuda")
-
     while jobs:
         jobs = run(jobs)
         _wait_for_one(jobs)
@@ -170,6 +174,7 @@ def label_sequence(job: LabelJob, tick: Tick) -> SequenceRecord:
     """
     job = replace(job, store=folder_here(job.store, job.url))
     with claimed(job.lock, job.path):
+        looked_up(job.store / job.name / RECORD_FILE)  # another machine may have done it
         done = finished_record(job.store, job.name)
         if done is not None:
             return done
@@ -257,7 +262,7 @@ def _failure(job: LabelJob, error: Exception) -> SequenceRecord:
     return replace(SequenceRecord(job.name, str(job.path), FAILED), reason=str(error))
 
 
-def _fingerprint(settings: RunSettings, pack: bool) -> dict[str, Any]:
+def fingerprint(settings: RunSettings, pack: bool) -> dict[str, Any]:
     """Everything that the labels depend on; a weights file by its content."""
     import hashlib
 

@@ -74,20 +74,7 @@ def run_and_label(
 ) -> LabeledRun:
     """Track a sequence, label its tracks, and write trajectory, map, tracks, labels and report into `folder`.
 
-    An interrupt (KeyboardInterrupt) ends the sequence there: what was tracked is written as a valid result.
-
-    Args:
-        sequence: the frames.
-        folder: made if need be; must be empty or one that `command` made.
-        settings: all of them; `settings.sequence` is only recorded.
-        command: that the folder belongs to.
-        frontend: in place of the one that the settings name.
-        visualizer: is shown every frame.
-        progress: is called after every frame.
-
-    Raises:
-        InputError: fewer than three readable frames.
-        OutputError: the folder cannot be used.
+    Arguments, errors and interrupts as `run_odometry`.
     """
     summary = run_odometry(sequence, folder, settings, command, frontend, visualizer, progress)
     return apply_quality_gate(summary, settings.labels)

@@ -2,8 +2,9 @@
 
 A sample is the beginning of a few of the recordings, labelled in a process like that of a worker. Its processor time is
 measured and not its duration, so that other work on the machine hardly matters. The cost of a recording is taken to be
-that of opening it and a number for each frame; the first frames of a sample, which need a start of the map, are left
-out of the latter.
+a number for itself and one for each frame. The latter is that of the later frames of a sample; what opening and the
+first frames, which need a start of the map, cost beyond it is the former. A sample that is a whole recording needs no
+such distinction: all its frames count.
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.jobs.processes import Tick, run_in_processes
-from improvo.labeling.label_sequences import LabelJob, label_sequence
-from improvo.labeling.store import DONE
+from improvo.labeling.label_sequences import LabelJob, fingerprint, label_sequence
+from improvo.labeling.store import DONE, LabelStore
 from improvo.odometry.run_settings import RunSettings
 
-SAMPLES = 3  # recordings
-SAMPLE_FRAMES = 150  # of each
+SAMPLE_FRAMES = 150  # of a recording
+_SAMPLES = 3  # recordings, at least
+_ALL_SAMPLE_FRAMES = 450  # more recordings, where they are so short that all samples together have less
 _START_FRAMES = 30  # not counted in the seconds of a frame
 _LOOKED_AT = 100  # recordings that are opened for their length, at most
 _MIB = 1 << 20
@@ -40,7 +42,7 @@ class LabelPlan:
     longest_frames: int  # of one recording, which one worker does
     sample_frames: int
     frame_seconds: float  # of one core, for a frame
-    recording_seconds: float  # of one core, for opening a recording and loading what labels it
+    recording_seconds: float  # of one core, for a recording beside its frames: opening it, the start of its map
     memory_mib: int  # of a worker; 0 where the system does not say
     frame_bytes: float  # on disk
 
@@ -65,8 +67,8 @@ class _Sample:
     """What one sample took."""
 
     frames: int
-    opening: float  # seconds of the processor until the first frame was done
-    frame: float  # for a later frame, with all that is done at the end
+    recording: float  # seconds of the processor beside those of the frames
+    frame: float  # for a later frame, with its share of what is done at the end
     memory_mib: int
     folder_bytes: int
 
@@ -76,6 +78,7 @@ def plan_labels(
     settings: RunSettings,
     pack: bool = False,
     on_frames: Callable[[int], None] = lambda count: None,
+    folder: Path | None = None,
 ) -> LabelPlan:
     """Label a sample, and reckon.
 
@@ -84,6 +87,7 @@ def plan_labels(
         settings: of the odometry and the labels.
         pack: whether the frames are kept beside the labels.
         on_frames: is told the number of further frames of the sample processed.
+        folder: label store to keep the samples in; nothing is kept if None.
 
     Raises:
         InputError: none of the samples could be labelled.
@@ -92,8 +96,10 @@ def plan_labels(
     if not lengths:
         raise InputError(f"{paths[0]}: cannot be opened, nor can any other recording that was tried; check the paths")
     tried = list(lengths)
-    chosen = [tried[row] for row in np.unique(np.linspace(0, len(tried) - 1, SAMPLES).round().astype(int))]
-    short = replace(settings, sequence=replace(settings.sequence, max_frames=_sample_frames(settings)))
+    most = _sample_frames(settings)
+    count = max(_SAMPLES, _ALL_SAMPLE_FRAMES // max(round(np.mean([min(n, most) for n in lengths.values()])), 1))
+    chosen = [tried[row] for row in np.unique(np.linspace(0, len(tried) - 1, count).round().astype(int))]
+    short = replace(settings, sequence=replace(settings.sequence, max_frames=most))
     samples: list[_Sample] = []
     failures: list[Exception] = []
 
@@ -103,8 +109,9 @@ def plan_labels(
         else:
             failures.append(result)
 
-    with tempfile.TemporaryDirectory(prefix="improvo-plan-") as folder:
-        jobs = [LabelJob(f"sample-{row}", path, Path(folder), short, pack) for row, path in enumerate(chosen)]
+    with tempfile.TemporaryDirectory(prefix="improvo-plan-") as temporary:
+        store = LabelStore(folder or Path(temporary), fingerprint(short, pack), kind=type(short)).folder
+        jobs = [LabelJob(f"sample-{row}", path, store, short, pack) for row, path in enumerate(chosen)]
         run_in_processes(_sampled, jobs, on_result, on_frames, 1)
     if not samples:
         raise InputError(f"no sample could be labelled; the first: {failures[0]}")
@@ -115,7 +122,7 @@ def plan_labels(
         longest_frames=max(lengths.values()),
         sample_frames=sum(sample.frames for sample in samples),
         frame_seconds=float(np.average([s.frame for s in samples], weights=[s.frames for s in samples])),
-        recording_seconds=float(np.median([sample.opening for sample in samples])),
+        recording_seconds=float(np.median([sample.recording for sample in samples])),
         memory_mib=max(sample.memory_mib for sample in samples),
         frame_bytes=sum(sample.folder_bytes for sample in samples) / sum(sample.frames for sample in samples),
     )
@@ -152,11 +159,13 @@ def _sampled(job: LabelJob, tick: Tick) -> _Sample:
     if record.state != DONE:
         raise InputError(record.reason)
     ended = time.process_time()
-    first = min(_START_FRAMES, len(ticks) // 2)
-    frame = (ended - ticks[first - 1]) / (len(ticks) - first) if first else (ended - begun) / max(len(ticks), 1)
+    whole = len(ticks) < (job.settings.sequence.max_frames or 0)
+    first = 1 if whole else min(_START_FRAMES, len(ticks) // 2)
+    frame = (ended - ticks[first - 1]) / max(len(ticks) - first, 1)
+    recording = max(ended - begun - frame * len(ticks), 0.0)
     files = [path for path in (job.store / job.name).rglob("*") if path.is_file()]
     size = sum(path.stat().st_size for path in files)
-    return _Sample(record.frames, ticks[0] - begun, frame, _peak_mib(), size)
+    return _Sample(record.frames, recording, frame, _peak_mib(), size)
 
 
 def _peak_mib() -> int:

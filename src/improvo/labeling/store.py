@@ -37,7 +37,7 @@ from improvo.files import (
     written_atomically,
 )
 from improvo.folder_lock import LOCK, BusyError, holder_of, locked, seems_held
-from improvo.locations import publish, removed
+from improvo.locations import lock_files, publish, removed
 from improvo.untrusted.text import read_json_file
 
 MANIFEST_FILE, SETTINGS_FILE, RECORD_FILE = "manifest.parquet", "settings.yaml", "label.json"
@@ -131,7 +131,7 @@ class LabelStore:
         Raises:
             BusyError: another command labels here.
         """
-        for lock in self.folder.glob(".*.lock"):
+        for lock in {*self.folder.glob(".*.lock"), *lock_files(self.folder)}:
             if lock.name != LOCK and seems_held(lock):
                 raise BusyError(self.folder, holder_of(lock) or "another process")
         for record in self.records():

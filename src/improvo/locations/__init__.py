@@ -1,11 +1,11 @@
 """Folders anywhere: on S3, Google Cloud Storage and all that fsspec reaches, each with a local folder in its stead.
 
-It imports `errors` only. Open this file first, then `place.py`.
+It imports `errors` only. Open this file first, then `place.py`; `claim.py` is about two at once.
 
 A command gets the local folder and works there as in any other. What is read is fetched when it is first asked for
 (`fetched`); what is complete is sent at once (`written`, called by `improvo.files`) or as a whole (`publish`). Label
-tables and packed frames are fetched one by one, all else when the location is opened. Nobody else may write to a
-location meanwhile, except that several commands may label into one.
+tables and packed frames are fetched one by one, all else when the location is opened. Who works there says so in a
+lock file at the location, see `improvo.folder_lock`; several commands may label into one.
 """
 
 from __future__ import annotations
@@ -18,9 +18,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from improvo.errors import InputError, OutputError
-from improvo.locations.place import RECORD, STATE, Place, belongs
+from improvo.errors import OutputError
+from improvo.locations.claim import Claim, IsDead, read_claim
+from improvo.locations.place import RECORD, STATE, LocationReadError, LocationWriteError, Place, belongs
 
+LOCATION_ERRORS = (LocationReadError, LocationWriteError)
 _SCHEME = re.compile(r"([a-z][a-z0-9+.-]*)://(.+)", re.DOTALL)
 _FILES = "files"  # in a folder for each location
 _places: dict[Path, Place] = {}
@@ -79,6 +81,48 @@ def refresh(folder: Path) -> None:
         place.open()
 
 
+def looked_up(path: Path) -> Path:
+    """The path, whose file is here now if its location has it by now; others may have written it.
+
+    Raises:
+        InputError: it cannot be fetched.
+    """
+    place = _place_of(path)
+    if place is not None and not path.exists():
+        place.look(path)
+        place.fetch(path)
+    return path
+
+
+def take_claim(path: Path, mine: dict[str, Any], is_dead: IsDead) -> Claim | None:
+    """A lock file at the location that the path belongs to; None for a path of this machine.
+
+    Args:
+        path, mine, is_dead: see `Claim`.
+
+    Raises:
+        ClaimedError, LocationReadError, LocationWriteError: see `Claim`.
+    """
+    place = _place_of(path)
+    return Claim(place, path, mine, is_dead) if place is not None and place.writing else None
+
+
+def claimant(path: Path) -> dict[str, Any] | None:
+    """Who holds a lock file at a location; None if nobody does, and for a path of this machine.
+
+    Raises:
+        LocationReadError: the location does not answer.
+    """
+    place = _place_of(path)
+    return read_claim(place, path) if place is not None and place.writing else None
+
+
+def lock_files(folder: Path) -> list[Path]:
+    """The local paths of all lock files that lay at the location of a folder when it was last looked at."""
+    place = _place_of(folder)
+    return [place.folder / name for name in place.locks] if place is not None else []
+
+
 def with_urls(text: str) -> str:
     """A text for a person: locations in place of the folders that stand for them."""
     for folder, place in _places.items():
@@ -121,7 +165,7 @@ def opened(path: Path) -> Any:
     if place is None or place.name(path) not in place.listing:
         return path
     target = place.remote(path)
-    return place.tries(lambda: place.fs.open(target, "rb", block_size=1 << 20), "read", InputError)
+    return place.tries(lambda: place.fs.open(target, "rb", block_size=1 << 20), "read", LocationReadError)
 
 
 def exists(path: Path) -> bool:
@@ -181,6 +225,8 @@ def close(success: bool = True) -> None:
     try:
         for place in list(_places.values()):
             if place.writing:
+                if not success:
+                    place.give_up()
                 place.send_all(place.folder)
     except OutputError:
         if success:

@@ -12,14 +12,26 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from improvo.errors import InputError, MissingExtraError, OutputError
+from improvo.errors import InputError, MissingExtraError, OutputError, imported
 
 Answer = TypeVar("Answer")
 
 STATE = "place.json"  # beside the folder: what of it is at the location
+MARKER = ".improvo.json"  # of a folder that a command of ours has made
 RECORD = "label.json"  # of a sequence of labels; it is sent last
-_KEPT_HIDDEN = re.compile(r"\.improvo\.json|\..+\.failed\.json")  # hidden files that belong to a folder's content
+_KEPT_HIDDEN = re.compile(re.escape(MARKER) + r"|\..+\.failed\.json")  # hidden files that belong to a folder's content
+_LOCK = re.compile(r"\.[^/]+\.lock")
 _WAITS = (0.5, 2.0, 8.0)  # seconds between tries
+# On S3, the tries here are the only ones: botocore's and s3fs's own, one within the other, would take many minutes.
+_S3 = {"retries": {"total_max_attempts": 1}, "connect_timeout": 10, "read_timeout": 30}
+
+
+class LocationReadError(InputError):
+    """A location cannot be read, after all tries; the next command on it goes on."""
+
+
+class LocationWriteError(OutputError):
+    """A location cannot be written to, after all tries; the next command on it goes on."""
 
 
 class Place:
@@ -28,21 +40,25 @@ class Place:
     def __init__(self, url: str, folder: Path, writing: bool) -> None:
         self.url, self.folder, self.writing = url, folder, writing
         self.listing: dict[str, int] = {}  # bytes of every file at the location, by its name in the folder
+        self.locks: list[str] = []  # names of lock files at the location
         self._sent: dict[str, list[int]] = {}  # bytes and time of every local file that is the one at the location
         self._process = -1
+        self._away = False  # it did not answer last time: one try is enough to see whether it is back
         self._state = folder.parent / STATE
 
     @property
     def fs(self) -> Any:
         """The file system, of this process: connections do not survive a fork."""
         if self._process != os.getpid():
+            fsspec = imported("fsspec", self.url, "remote")
             try:
-                import fsspec
-            except ImportError:
-                raise MissingExtraError(f"{self.url}", "remote") from None
-            try:
-                new = {"skip_instance_cache": True} if self._process != -1 else {}
-                self._fs, self._root = fsspec.core.url_to_fs(self.url, **new)
+                options: dict[str, Any] = {"skip_instance_cache": True} if self._process != -1 else {}
+                on_s3 = self.url.startswith(("s3:", "s3a:"))
+                if on_s3 and "config_kwargs" not in fsspec.config.conf.get("s3", {}):
+                    options["config_kwargs"] = _S3
+                self._fs, self._root = fsspec.core.url_to_fs(self.url, **options)
+                if on_s3:
+                    self._fs.retries = 1
             except (ImportError, ValueError) as error:
                 reason = " ".join(str(error).split())
                 raise InputError(f"{self.url}: cannot be reached ({reason}); `pip install s3fs` or its like") from None
@@ -53,14 +69,15 @@ class Place:
         """Know what is there, and fetch it; of a label store only the records, its tables are fetched one by one."""
         with suppress(OSError, ValueError, TypeError):
             self._sent = dict(json.loads(self._state.read_text())["sent"])
-        found = self.tries(self._find, "read", InputError)
+        found = self.tries(self._find, "read", LocationReadError)
         self.listing = {name: size for name, size in found.items() if name}
         for name, (size, _) in list(self._sent.items()):
             path = self.folder / name
             if not self._is_sent(path) and path.exists():
                 continue  # changed here and not sent
             if self.listing.get(name) != size:  # changed there
-                path.unlink(missing_ok=True)
+                if name != MARKER:  # whose the folder is stays true
+                    path.unlink(missing_ok=True)
                 del self._sent[name]
         one_by_one = {
             name.split("/")[0] for name in self.listing if name.count("/") == 1 and name.endswith(f"/{RECORD}")
@@ -81,6 +98,23 @@ class Place:
         name = self.name(path)
         return str(self._root if name == "." else f"{self._root.rstrip('/')}/{name}")
 
+    def look(self, path: Path) -> None:
+        """Know whether a file is there now."""
+        target = self.remote(path)
+
+        def ask() -> int | None:
+            self.fs.invalidate_cache()
+            try:
+                return int(self.fs.info(target).get("size") or 0)
+            except FileNotFoundError:
+                return None
+
+        size = self.tries(ask, "read", LocationReadError)
+        if size is None:
+            self.listing.pop(self.name(path), None)
+        else:
+            self.listing[self.name(path)] = size
+
     def fetch(self, path: Path) -> None:
         """Bring a file here, if it is there; it appears as a whole."""
         name = self.name(path)
@@ -89,7 +123,7 @@ class Place:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_name(f".{path.name}.{os.getpid()}-fetched.partial")
         try:
-            self.tries(lambda: self.fs.get_file(self.remote(path), str(temporary)), "read", InputError)
+            self.tries(lambda: self.fs.get_file(self.remote(path), str(temporary)), "read", LocationReadError)
             os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
@@ -107,10 +141,14 @@ class Place:
                 self.fs.makedirs(parent, exist_ok=True)
             self.fs.put_file(str(path), target)
 
-        self.tries(put, "written", OutputError)
+        self.tries(put, "written", LocationWriteError)
         self.listing[self.name(path)] = path.stat().st_size
         self._note(path)
         self._remember()
+
+    def give_up(self) -> None:
+        """From now on, one try for each file."""
+        self._away = True
 
     def send_all(self, folder: Path) -> None:
         """Bring all there that is complete; records of finished sequences last."""
@@ -131,13 +169,17 @@ class Place:
         gone = [other for other in self.listing if other == name or other.startswith(f"{name}/")]
         for other in sorted(gone, key=lambda other: not other.endswith(RECORD)):
             target = self.remote(self.folder / other)
-            self.tries(partial(self.fs.rm_file, target), "written", OutputError, missing=True)
+            self.tries(partial(self.fs.rm_file, target), "written", LocationWriteError, missing=True)
             del self.listing[other]
             self._sent.pop(other, None)
         self._remember()
 
     def tries(
-        self, action: Callable[[], Answer], what: str, kind: type[InputError | OutputError], missing: bool = False
+        self,
+        action: Callable[[], Answer],
+        what: str,
+        kind: type[LocationReadError | LocationWriteError],
+        missing: bool = False,
     ) -> Answer:
         """The answer of an action on the file system, which is tried again a few times.
 
@@ -147,10 +189,12 @@ class Place:
             kind: of the error.
             missing: whether a file that is not there is no fault.
         """
-        for wait in (*_WAITS, None):
+        for wait in (*(() if self._away else _WAITS), None):
             try:
-                return action()
-            except (InputError, MissingExtraError):
+                answer = action()
+                self._away = False
+                return answer
+            except (InputError, MissingExtraError):  # of the scheme
                 raise
             except FileNotFoundError as error:
                 if missing:
@@ -161,8 +205,9 @@ class Place:
             if wait is None or isinstance(fault, PermissionError | FileNotFoundError):
                 break
             time.sleep(wait)
+        self._away = not isinstance(fault, PermissionError | FileNotFoundError)
         reason = " ".join(str(fault).split())[:120] or type(fault).__name__
-        end = f"what is done is kept in {self.folder}; run again to go on" if what == "written" else "try again"
+        end = f"what is done is kept in {self.folder.parent}; run again to go on" if what == "written" else "try again"
         raise kind(f"{self.url}: cannot be {what} ({reason}); {end}") from None
 
     def _find(self) -> dict[str, int]:
@@ -174,11 +219,9 @@ class Place:
             found = fs.find(root, detail=True)
         except FileNotFoundError:
             return {}
-        return {
-            name: int(entry.get("size") or 0)
-            for full, entry in found.items()
-            if (name := full.removeprefix(root).lstrip("/")) and belongs(name)
-        }
+        sizes = {full.removeprefix(root).lstrip("/"): int(entry.get("size") or 0) for full, entry in found.items()}
+        self.locks = [name for name in sizes if _LOCK.fullmatch(name)]
+        return {name: size for name, size in sizes.items() if name and belongs(name)}
 
     def _is_sent(self, path: Path) -> bool:
         try:

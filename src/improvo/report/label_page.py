@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from improvo.errors import PLOTS_MISSING, plots_installed
 from improvo.labeling.store import DONE, read_records
 from improvo.odometry.run_folder import RunFolder
 from improvo.report.map_picture import map_png
@@ -57,7 +58,9 @@ def write_label_page(folder: Path, path: Path, palette: Palette = PALETTES["pape
             warnings(run.report, np.zeros(0, np.int64), np.zeros(0), float("nan")),
             "Every frame has a pose, in one segment.",
         )
-        if len(run.trajectory):
+        if len(run.trajectory) and not plots_installed():
+            page.paragraph(f"Its map, seen from above: {PLOTS_MISSING}.", note=True)
+        elif len(run.trajectory):
             page.picture(map_png(run, palette), f"{run.name} from above", map_png(run, palette, narrow=True))
     page.write(path)
 

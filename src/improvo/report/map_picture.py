@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from improvo.errors import InputError
+from improvo.errors import InputError, require_plots
 from improvo.files import written_atomically
 from improvo.odometry.run_folder import RunFolder
 from improvo.report.overhead import overhead_axes, robust_limits
@@ -30,6 +30,7 @@ def draw_map(run: RunFolder, path: Path, palette: Palette = PALETTES["paper"], l
     Raises:
         InputError: no frame of the run has a pose.
         OutputError: the file cannot be written.
+        MissingExtraError: matplotlib is not installed.
     """
     picture = map_png(run, palette, last_poses)
     with written_atomically(path) as temporary:
@@ -49,7 +50,9 @@ def map_png(
 
     Raises:
         InputError: no frame of the run has a pose.
+        MissingExtraError: matplotlib is not installed.
     """
+    require_plots("a map seen from above")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
@@ -184,9 +187,10 @@ def _point_style(count: int) -> tuple[float, float]:
 def _time_bar(figure: object, axis: object, palette: Palette, frames: int, last: int) -> None:
     """The colour bar."""
     from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
+    from matplotlib.colors import ListedColormap, Normalize
 
-    scale = ScalarMappable(Normalize(0, max(frames - 1, 1)), palette.colormap())
+    colours = ListedColormap(list(palette.ramp_table() / 255.0))
+    scale = ScalarMappable(Normalize(0, max(frames - 1, 1)), colours)
     bar = figure.colorbar(scale, ax=axis, fraction=0.035, pad=0.02)  # type: ignore[attr-defined]
     bar.set_label(f"frame (black: the last {last})", fontsize=8)
     bar.ax.tick_params(labelsize=8)

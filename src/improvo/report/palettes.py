@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +11,13 @@ from improvo.errors import ConfigError
 from improvo.stability.rule import IGNORE, STABLE, UNSTABLE
 from improvo.types import UInt8
 
-if TYPE_CHECKING:
-    from matplotlib.colors import ListedColormap
-
+RAMP_STEPS = 256
 RGB = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
 class Palette:
-    """Colours as RGB; `ramp` is a name of Matplotlib's."""
+    """Colours as RGB; `ramp` is `jet` or `viridis`."""
 
     name: str
     ramp: str  # from early, young or small to late, old or large
@@ -33,14 +30,15 @@ class Palette:
     def ramp_colours(self, values: NDArray[np.number], low: float, high: float) -> UInt8:
         """(N, 3) RGB of values between `low` and `high`; values beyond take the colour of the end."""
         share = np.clip((np.asarray(values, np.float64) - low) / max(high - low, 1e-12), 0.0, 1.0)
-        return (self.colormap()(share)[..., :3] * 255 + 0.5).astype(np.uint8)
+        return self.ramp_table()[(share * (RAMP_STEPS - 1) + 0.5).astype(np.int64)]
 
-    def colormap(self) -> ListedColormap:
-        """The ramp for Matplotlib, without its darkest ends, which are lost on dark pictures."""
-        import matplotlib
-        from matplotlib.colors import ListedColormap
+    def ramp_table(self) -> UInt8:
+        """(256, 3) RGB: the ramp without its darkest ends, which are lost on dark pictures."""
+        import cv2
 
-        return ListedColormap(matplotlib.colormaps[self.ramp](np.linspace(0.08, 0.94, 256)))
+        levels = np.rint(np.linspace(0.08, 0.94, RAMP_STEPS) * 255).astype(np.uint8)
+        maps = {"jet": cv2.COLORMAP_JET, "viridis": cv2.COLORMAP_VIRIDIS}
+        return np.ascontiguousarray(cv2.applyColorMap(levels[:, None], maps[self.ramp])[:, 0, ::-1])
 
     def ramp_strip(self, length: int = 140) -> UInt8:
         """(length, 3) RGB: the ramp from end to end, for a legend."""

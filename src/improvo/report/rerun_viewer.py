@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from improvo.errors import MissingExtraError, OutputError
+from improvo.errors import OutputError, imported
 from improvo.files import written_atomically
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
@@ -134,10 +134,7 @@ class _Recording:
     """Rerun's recording stream, in our nouns."""
 
     def __init__(self, save: Path | None) -> None:
-        try:
-            import rerun
-        except ImportError:
-            raise MissingExtraError("the live viewer", "view") from None
+        rerun = imported("rerun", "the live viewer", "view")
         if save is not None and not save.absolute().parent.is_dir():
             raise OutputError(f"{save}: no folder {save.parent}; make it first")
         self._rerun: Any = rerun

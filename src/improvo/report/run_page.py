@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from improvo.errors import InputError
+from improvo.errors import PLOTS_MISSING, InputError, plots_installed
 from improvo.odometry.run_folder import RunFolder
 from improvo.odometry.verdict.told_verdicts import verdict_lines, verdict_of
 from improvo.odometry.verdict.verdict import DOUBTFUL
@@ -136,6 +136,9 @@ def _map_section(page: Page, run: RunFolder, palette: Palette, truth: TruePath |
         )
     )
     page.script("scene.js", "scene-data", data)
+    if not plots_installed():
+        page.paragraph(f"The same as a picture, for prints: {PLOTS_MISSING}.", note=True)
+        return
     colours = "from blue to red" if palette.name == "paper" else "from dark to bright"
     page.picture(
         map_png(run, palette),

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 
 from improvo.geometry import se3
 from improvo.self_calibration.elimination import back_substitute, eliminate
@@ -120,7 +119,7 @@ def covariance(scene: Scene) -> Float64:
     # the world may lie anywhere, and a view may have lost all its observations: the lens does not depend on either
     poses = poses + np.diag(1e-9 * (np.diag(poses) + np.diag(poses).mean()))
     try:
-        with_lens = scipy.linalg.cho_solve(scipy.linalg.cho_factor(poses), reduced[:size, size:]).reshape(views, 6, 7)
+        with_lens = _solved(poses, reduced[:size, size:]).reshape(views, 6, 7)
     except (np.linalg.LinAlgError, ValueError):
         return np.full((7, 7), np.inf)
     # what a change of the lens does to each pixel after views and points have followed it as far as they can
@@ -212,6 +211,18 @@ def _prior(scene: Scene) -> tuple[Float64, Float64, float]:
     return rows.T @ rows, rows.T @ off, 0.5 * float(off @ off)
 
 
+def _solved(matrix: Float64, right: Float64) -> Float64:
+    """The solution of symmetric equations.
+
+    Raises:
+        np.linalg.LinAlgError: the matrix is not positive definite.
+    """
+    if not np.isfinite(matrix).all():
+        raise np.linalg.LinAlgError("not finite")
+    np.linalg.cholesky(matrix)  # raises
+    return np.asarray(np.linalg.solve(matrix, right), np.float64)
+
+
 def _held_scale(scene: Scene, reduced: Float64) -> Float64:
     """What holds the scale of each world, (6 V, 6 V): the speed in `motion` is in the unit that the odometry chose."""
     shifts = np.zeros((len(scene.world), 6))
@@ -233,7 +244,7 @@ def _stepped(scene: Scene, system: tuple[Float64, ...], first: Int64, damping: f
     diagonal = np.diag(reduced).copy()
     reduced[np.diag_indices_from(reduced)] += damping * diagonal + 1e-12
     try:
-        step = scipy.linalg.cho_solve(scipy.linalg.cho_factor(reduced), right)
+        step = _solved(reduced, right)
     except (np.linalg.LinAlgError, ValueError):
         return None
     if not np.isfinite(step).all():

@@ -21,6 +21,7 @@ from improvo.self_calibration.lens import MODELS, NAMES, Lens
 from improvo.self_calibration.raw_features import Piece, detect_pieces, open_raw, piece_rows
 from improvo.self_calibration.settings import SelfCalibrationSettings
 from improvo.self_calibration.tracked import TrackedPiece, scene_of, track_piece
+from improvo.terminal import counted
 
 _MIN_FRAMES = 20
 _MIN_PAIRS = 2
@@ -117,7 +118,9 @@ def camera_from_motion(
     sequence = open_raw(path, settings.sequence, settings.max_width)
     name, size = str(path), (sequence.raw_camera.width, sequence.raw_camera.height)
     if len(sequence) < _MIN_FRAMES:
-        raise InputError(f"{name}: {len(sequence)} frames are too few to find its camera; at least {_MIN_FRAMES}")
+        raise InputError(
+            f"{name}: has {counted(len(sequence), 'frame')}; finding its camera needs at least {_MIN_FRAMES}"
+        )
     rows = piece_rows(sequence.times, settings.frames, settings.pieces, settings.max_rate)
     total, done = sum(map(len, rows)), 0
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
@@ -132,7 +131,7 @@ def _motion(views: list[FinalView], row: int) -> Float64:
     if seconds <= 0:
         return np.zeros(6)
     last_from_first = se3.inverse(last.world_from_cam) @ first.world_from_cam
-    turn = Rotation.from_matrix(last_from_first[:3, :3]).as_rotvec()
+    turn = se3.so3_log(last_from_first[:3, :3])
     return np.concatenate([last_from_first[:3, 3], turn]) / seconds
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
-from improvo.geometry.se3 import rigid
+from improvo.geometry.se3 import rigid, so3_exp, so3_log
 from improvo.types import Float64, Int64, Trajectory
 
 SAME_TIME = 1e-4  # seconds; stamps this close are the same time, rounded
@@ -44,9 +43,11 @@ def poses_at(trajectory: Trajectory, times: Float64) -> Trajectory:
         between &= np.minimum(times - stamps[left], stamps[right] - times) > SAME_TIME
         between &= trajectory.segment[known][left] == trajectory.segment[known][right]
         if between.any():
-            rotation = Slerp(stamps, Rotation.from_matrix(poses[:, :3, :3]))(times[between]).as_matrix()
             share = ((times - stamps[left]) / (stamps[right] - stamps[left]))[between, None]
-            position = (1 - share) * poses[left[between], :3, 3] + share * poses[right[between], :3, 3]
+            first, last = poses[left[between]], poses[right[between]]
+            turn = so3_log(np.swapaxes(first[:, :3, :3], -1, -2) @ last[:, :3, :3])
+            rotation = first[:, :3, :3] @ so3_exp(share * turn)
+            position = (1 - share) * first[:, :3, 3] + share * last[:, :3, 3]
             result[between] = rigid(rotation, position)
             segment[between] = trajectory.segment[known][left[between]]
     return Trajectory(np.asarray(times, np.float64), result, segment)

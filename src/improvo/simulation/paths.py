@@ -5,13 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline, PchipInterpolator
 
-from improvo.errors import ConfigError
+from improvo.errors import ConfigError, MissingExtraError
 from improvo.geometry.se3 import rigid, so3_exp
 from improvo.simulation.room import Floor
 from improvo.simulation.settings import SimulationSettings
 from improvo.types import Float64
+
+try:
+    from scipy.interpolate import CubicSpline, PchipInterpolator
+except ImportError:
+    raise MissingExtraError("simulate", "simulate") from None
 
 
 @dataclass(frozen=True)

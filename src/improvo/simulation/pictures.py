@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
 
 from improvo.simulation.textures import SIZE, blend, carpet, cloud, colour, rgb
 from improvo.types import UInt8
@@ -78,6 +77,8 @@ def printed_page(rng: np.random.Generator) -> UInt8:
 
 def mosaic(rng: np.random.Generator) -> UInt8:
     """A poster of random coloured cells."""
+    from scipy.spatial import cKDTree
+
     seeds = rng.uniform(0, SIZE, (90, 2)).astype(np.float32)
     y, x = np.mgrid[:SIZE:2, :SIZE:2].astype(np.float32)
     _, cells = cKDTree(seeds).query(np.stack([x.ravel(), y.ravel()], axis=1))

@@ -125,12 +125,12 @@ def model_card(
             "settings": config.to_dict(settings),
             "versions": {"improvo": __version__, "torch": str(torch.__version__), "numpy": np.__version__},
         },
-        commit=_commit(),
+        commit=commit_of_code(),
         notes="The stability head is not part of these weights: only VO adaptation can teach it.",
     )
 
 
-def _commit() -> str:
+def commit_of_code() -> str:
     """The commit of the code, where it runs from a checkout."""
     import subprocess
 

@@ -88,6 +88,15 @@ def read_json_file(path: Path, mend: str) -> dict[str, Any]:
     return content
 
 
+def is_number(text: str) -> bool:
+    """Whether it reads as a number, `nan` and `inf` too."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 def reason(error: BaseException) -> str:
     """A foreign error on one line, not too long."""
     words = error.strerror if isinstance(error, OSError) and error.strerror else str(error)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from improvo.errors import InputError, MissingExtraError
+from improvo.errors import InputError, imported
 from improvo.evaluation.sources import best
 from improvo.frontend.masking import without_masked
 from improvo.sequences import Sequence
@@ -185,10 +185,7 @@ def _read_npz(path: Path) -> dict[str, Any]:
 
 
 def _hdf5(path: str) -> Any:
-    try:
-        import h5py
-    except ImportError:
-        raise MissingExtraError("reading hloc's HDF5 features", "hdf5") from None
+    h5py = imported("h5py", "reading hloc's HDF5 features", "hdf5")
     try:
         return h5py.File(path, "r")
     except OSError:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from improvo.errors import require_plots
 from improvo.evaluation.plots import COLOURS
 from improvo.evaluation.stability.causes import PRECEDENCE
 from improvo.evaluation.stability.protocol import HEADLINE, ScoredPoints
@@ -20,7 +21,11 @@ def draw_stability(scored: dict[str, ScoredPoints], results: dict[str, Any], pat
         scored: subject name -> its points.
         results: content of `stability.json`.
         path: PNG to write.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
     """
+    require_plots("pictures of curves")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

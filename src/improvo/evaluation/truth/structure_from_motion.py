@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from improvo.errors import InputError, MissingExtraError
+from improvo.errors import InputError, imported
 from improvo.evaluation.truth.settings import TruthSettings
 from improvo.files import write_picture
 from improvo.geometry.camera import Camera
@@ -58,10 +58,7 @@ def load_pycolmap() -> Any:
     Raises:
         MissingExtraError: it is not installed.
     """
-    try:
-        import pycolmap
-    except ImportError:
-        raise MissingExtraError("structure from motion", "truth") from None
+    pycolmap = imported("pycolmap", "structure from motion", "truth")
     pycolmap.logging.minloglevel = 3  # FATAL: what goes wrong is told by what is missing from the result
     return pycolmap
 

@@ -9,6 +9,7 @@ from improvo.geometry.camera_files import colmap
 from improvo.geometry.camera_files.calibration import Calibration, checked, four
 from improvo.geometry.camera_files.distortion import usual_length
 from improvo.geometry.camera_files.one_camera import of_matrix
+from improvo.untrusted.text import is_number
 
 _DSO_MODELS = {
     "pinhole": (5, "brown"),
@@ -33,7 +34,7 @@ def is_plain(text: str) -> bool:
         return True
     if len(first) > 4 and re.fullmatch(r"[A-Z_]{3,}", first[1]) and first[0].isdecimal():
         return True
-    return all(_is_number(field) for field in first)
+    return all(is_number(field) for field in first)
 
 
 def from_plain_text(text: str, source: str, wanted: str | None) -> Calibration:
@@ -56,7 +57,7 @@ def from_plain_text(text: str, source: str, wanted: str | None) -> Calibration:
         raise ValueError(f"has one camera only, so there is no `{wanted}`")
     if rows and rows[0][0].lower() in _DSO_MODELS:
         return checked(_dso(rows[0][0].lower(), rows, source))
-    if rows and not all(_is_number(field) for row in rows[:1] for field in row):
+    if rows and not all(is_number(field) for row in rows[:1] for field in row):
         raise ValueError("is no calibration of COLMAP, DSO, DPVO or KITTI")
     if [len(row) for row in rows] in ([3, 3, 3], [4, 4, 4, 4], [9], [16]):
         return checked(Calibration(source, of_matrix(tuple(float(field) for row in rows for field in row), "matrix")))
@@ -155,11 +156,3 @@ def _kitti_size(rows: dict[str, list[str]], name: str) -> tuple[int, int] | None
 def _rows(text: str) -> list[list[str]]:
     lines = (line.split("#")[0].strip() for line in text.splitlines())
     return [re.split(r"[\s,;]+", line.strip(",;")) for line in lines if line]
-
-
-def _is_number(field: str) -> bool:
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return True

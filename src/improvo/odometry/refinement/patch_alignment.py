@@ -103,6 +103,27 @@ def _sample(picture, x, y):  # type: ignore[no-untyped-def]
     return (1 - below) * top + below * bottom
 
 
+@inlined
+def _inverted(matrix, inverse):  # type: ignore[no-untyped-def]
+    """Write the inverse of a positive definite matrix (Gauss and Jordan); False where it is not one."""
+    count = len(matrix)
+    inverse[:] = matrix
+    positive = True
+    for p in range(count):
+        positive = positive and inverse[p, p] > 0
+        pivot = 1.0 / inverse[p, p]
+        inverse[p, p] = 1.0
+        for q in range(count):
+            inverse[p, q] *= pivot
+        for r in range(count):
+            if r != p:
+                factor = inverse[r, p]
+                inverse[r, p] = 0.0
+                for q in range(count):
+                    inverse[r, q] -= factor * inverse[p, q]
+    return positive
+
+
 @compiled
 def align_patches(image, starts, patches, middles, patch_from_image, max_move):  # type: ignore[no-untyped-def]
     """The kernel of `align`: places (N, 2), correlation (N,), deviation (N,)."""
@@ -114,6 +135,7 @@ def align_patches(image, starts, patches, middles, patch_from_image, max_move): 
     deviation = np.full(len(starts), np.inf)
     template, columns, found = np.empty((side, side)), np.empty((_COLUMNS, size)), np.empty(size)
     normal, right = np.empty((_COLUMNS, _COLUMNS)), np.empty(_COLUMNS)
+    inverse = np.empty((_COLUMNS, _COLUMNS))
     weights = np.empty(size)
     for k in range(size):
         i, j = k // count - _HALF, k % count - _HALF
@@ -152,7 +174,8 @@ def align_patches(image, starts, patches, middles, patch_from_image, max_move): 
             continue
         for p in range(4, _COLUMNS):
             normal[p, p] += _RIDGE * (normal[p, p] + trace)
-        inverse = np.linalg.inv(normal)
+        if not _inverted(normal, inverse):
+            continue
         x, y, gain = starts[n, 0], starts[n, 1], 0.0
         converged = False
         for _ in range(_MAX_ITERATIONS):
