@@ -148,3 +148,17 @@ def test_labels_that_are_all_withheld_still_tell_what_was_tracked(good: Path, tm
     assert "of a doubtful path" not in record.reason
     assert "record with a camera that moves" in record.reason
     assert not (store / record.name).exists()
+
+
+def test_a_calibration_or_mask_for_all_that_is_not_there_is_said_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for option, what in (
+        ("--camera", "nothing.yaml: no such file"),
+        ("--mask", "nothing.yaml: no such file or folder"),
+    ):
+        assert main(["label", "demo", "-o", str(tmp_path / "labels"), option, str(tmp_path / "nothing.yaml")]) == 2
+        message = capsys.readouterr().err.strip()
+        assert what in message
+        assert "\n" not in message
+    assert list(tmp_path.iterdir()) == []

@@ -109,7 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.rounds < 1:
         raise ConfigError(f"--rounds {arguments.rounds}: must be at least 1")
     settings = settings_from(ImproveSettings, arguments, extra=_of_both_recipes(arguments))
-    check_recordings(arguments.sequences)
+    check_recordings(arguments.sequences, settings.sequence)
     check_frontend(settings.frontend.name)
     if arguments.plan:
         return _plan(arguments, settings)

@@ -78,7 +78,7 @@ def add_job_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Label what is not labelled yet; 0 unless nothing could be."""
     settings = settings_from(LabelRunSettings, arguments)
-    check_recordings(arguments.sequences)
+    check_recordings(arguments.sequences, settings.sequence)
     from improvo.frontend.registry import check_frontend
 
     check_frontend(settings.frontend.name, settings.frontend.network)

@@ -111,12 +111,25 @@ def read_folder_path(text: str) -> Path:
     return local_folder(text, writing=False)
 
 
-def check_recordings(paths: list[Path]) -> None:
+def check_recordings(paths: list[Path], settings: SequenceSettings) -> None:
     """Refuse a list of recordings of which none is there; where only some are missing, the rest is worked on.
 
+    Args:
+        paths: of the recordings.
+        settings: whose calibration and mask serve all of them, and must be there.
+
     Raises:
-        InputError: none is there.
+        InputError: none is there, or no calibration, or no mask.
     """
+    from improvo.sequences.rates import AUTO
+
+    if settings.camera not in (None, AUTO) and not Path(settings.camera).is_dir():  # a folder has one for each
+        from improvo.geometry.camera_files import load_calibration
+
+        load_calibration(settings.camera)
+    if settings.mask is not None and not Path(settings.mask).exists():
+        mend = "`improvo info SEQUENCE --write-mask FILE` makes one"
+        raise InputError(f"--mask {settings.mask}: no such file or folder; {mend}")
     from improvo.sequences.live import is_live
 
     if not any(path.exists() or is_live(str(path)) for path in paths):
