@@ -7,7 +7,8 @@
 the share of right matches (3 and 8 px) of the frames held back, by the reference, and by true poses and depth where the
 recording has them; then, for each recording and gap, the rank correlation (Spearman) of the two over the candidates.
 Candidates are the bundled weights, those given, and, without `--only`, sums and spoiled ones of `superpoint-small`.
-With `--only` it compares: every row with the first, with 95 % intervals (bootstrap over pairs).
+With `--only` it compares, the number of right matches too: every row with the first, with 95 % intervals (bootstrap
+over pairs).
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ from judge_candidates import written
 
 LIMITS = (3.0, 8.0)
 KEYPOINTS = 500
-Shares = dict[str, list[list[float]]]  # "judge 90" -> of each pair, the share within each limit
+# "judge 90" -> of each pair, the share within each limit, then the number; a share also rises where wrong ones are lost
+Shares = dict[str, list[list[float]]]
 
 
 @dataclass(frozen=True)
@@ -134,11 +136,12 @@ def _right(geometry: PairGeometry, a: Features, b: Features) -> list[float]:
     pixels = b.keypoints[matches[:, 1]].astype(np.float64)
     known = np.isfinite(points[:, 2])
     if known.sum() < 4:
-        return [0.0 for _ in LIMITS]
-    return [float(right_matches(geometry, points[known], pixels[known], limit).mean()) for limit in LIMITS]
+        return [0.0 for _ in 2 * LIMITS]
+    right = [right_matches(geometry, points[known], pixels[known], limit) for limit in LIMITS]
+    return [*(float(each.mean()) for each in right), *(float(each.sum()) for each in right)]
 
 
-def compared(found: dict[str, Shares], limit: int) -> None:
+def compared(found: dict[str, Shares], column: int) -> None:
     """Every candidate against the first, by the judge and by truth: all gaps with the same weight, then each."""
     first, *others = found
     for name in others:
@@ -147,17 +150,18 @@ def compared(found: dict[str, Shares], limit: int) -> None:
             gaps = [gap for gap in found[first] if gap.startswith(kind)]
             if gaps:
                 cells.append(
-                    f"{kind} {_gain(found[first], found[name], gaps, limit)}: "
-                    + ", ".join(f"{gap.split()[1]} {_gain(found[first], found[name], [gap], limit)}" for gap in gaps)
+                    f"{kind} {_gain(found[first], found[name], gaps, column)}: "
+                    + ", ".join(f"{gap.split()[1]} {_gain(found[first], found[name], [gap], column)}" for gap in gaps)
                 )
-        print(f"| {name} | {LIMITS[limit]:g} px | " + " | ".join(cells) + " |")
+        what = "share" if column < len(LIMITS) else "number"
+        print(f"| {name} | {what}, {LIMITS[column % len(LIMITS)]:g} px | " + " | ".join(cells) + " |")
 
 
-def _gain(before: Shares, after: Shares, gaps: list[str], limit: int) -> str:
-    base = np.mean([np.mean([pair[limit] for pair in before[gap]]) for gap in gaps])
+def _gain(before: Shares, after: Shares, gaps: list[str], column: int) -> str:
+    base = np.mean([np.mean([pair[column] for pair in before[gap]]) for gap in gaps])
     resampled, differences = [], []
     for number, gap in enumerate(gaps):
-        difference = np.array(after[gap])[:, limit] - np.array(before[gap])[:, limit]
+        difference = np.array(after[gap])[:, column] - np.array(before[gap])[:, column]
         resampled.append(Bootstrap(len(difference), number, 1000, 0.95).means(difference))
         differences.append(difference.mean())
     low, high = np.percentile(np.mean(resampled, axis=0), (2.5, 97.5))
@@ -203,15 +207,15 @@ def main() -> None:
             for chosen in opened(folder, tuple(arguments.gaps), arguments.pairs):
                 found = {}
                 for name, path in candidates.items():
-                    file = keep / folder.name / f"{name.replace(' ', '-')}.json"
+                    file = keep / folder.name / f"{name.replace(' ', '-')}.scores.json"
                     if not file.is_file():
                         file.parent.mkdir(parents=True, exist_ok=True)
                         file.write_text(json.dumps(shares(chosen, calibrated(path, folder, file.parent))))
                     found[name] = json.loads(file.read_text())
                 print(f"\n{chosen.name}: pairs " + ", ".join(f"{name}: {len(p)}" for name, p in chosen.pairs.items()))
                 if arguments.only:
-                    for limit in (1, 0):
-                        compared(found, limit)
+                    for column in (1, 0, 3, 2):
+                        compared(found, column)
                     continue
                 print("| candidate | " + " | ".join(found[bundled[0]]) + " |")
                 for name, values in found.items():

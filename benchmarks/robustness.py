@@ -76,14 +76,16 @@ def _file(arguments: argparse.Namespace, case: Case, frontend: str) -> Path:
 
 def _run(missing: list[tuple[Case, str]], arguments: argparse.Namespace) -> None:
     frontends = {name: load_frontend(name, MAX_KEYPOINTS) for name in dict.fromkeys(name for _, name in missing)}
-    caches = {name: FeatureCache(arguments.cache / "features", each, name) for name, each in frontends.items()}
+    folder, keep = arguments.cache / "features", not arguments.no_features
+    caches = {name: FeatureCache(folder, each, name, keep) for name, each in frontends.items()}
     clip, clip_case = None, None
     for number, (case, name) in enumerate(missing):
         if clip is None or case != clip_case:
             clip, clip_case = case.clip(arguments.cache, arguments.width), case
-        features = [caches[name](image, keep=not arguments.no_features) for image in clip.images]
+        for image in clip.images:  # not part of the time
+            caches[name](image)
         start = time.process_time()
-        judged = run_and_judge(clip, features, frontends[name], case.seed)
+        judged = run_and_judge(clip, caches[name], case.seed)
         seconds = time.process_time() - start
         about = {"case": case.name, "group": case.group, "what": case.what, "half": case.half, "seed": case.seed}
         content = {**about, "frontend": name, "seconds": round(seconds, 2), **judged.as_json()}

@@ -18,7 +18,7 @@ from improvo.files import written_atomically
 from improvo.frontend import Frontend
 from improvo.frontend.registry import CLASSICAL
 from improvo.frontend.weights import find_weights
-from improvo.types import Features, UInt8
+from improvo.types import Features, Mask, UInt8
 
 
 class FeatureCache:
@@ -28,9 +28,10 @@ class FeatureCache:
         folder: of the cache.
         frontend: computes what is missing.
         name: its name or weights file; the content of that file, and the code of all frontends, are part of the key.
+        keep: write what was missing into the cache.
     """
 
-    def __init__(self, folder: Path, frontend: Frontend, name: str) -> None:
+    def __init__(self, folder: Path, frontend: Frontend, name: str, keep: bool = True) -> None:
         digest = hashlib.blake2b(name.encode(), digest_size=8)
         if name not in CLASSICAL:
             digest.update(Path(find_weights(name)).read_bytes())
@@ -38,13 +39,13 @@ class FeatureCache:
             digest.update(file.read_bytes())
         self._folder = folder / f"{Path(name).stem}-{digest.hexdigest()}"
         self._frontend = frontend
+        self._keep = keep
+        self.name = frontend.name
 
-    def __call__(self, image: UInt8, keep: bool = True) -> Features:
-        """The features of a picture (H, W).
-
-        Args:
-            keep: write what was missing into the cache.
-        """
+    def __call__(self, image: UInt8, mask: Mask | None = None) -> Features:
+        """The features of a picture (H, W); with a mask of the odometry's choice, they are not kept."""
+        if mask is not None:
+            return _read(_packed(self._frontend(image, mask)))
         key = hashlib.blake2b(image.tobytes() + str(image.shape).encode(), digest_size=16).hexdigest()
         path = self._folder / key[:2] / f"{key}.npz"
         try:
@@ -52,7 +53,7 @@ class FeatureCache:
         except (FileNotFoundError, ValueError, KeyError, zipfile.BadZipFile):
             pass
         content = _packed(self._frontend(image))
-        if keep:
+        if self._keep:
             path.parent.mkdir(parents=True, exist_ok=True)
             with written_atomically(path) as temporary:
                 temporary.write_bytes(content)

@@ -10,6 +10,7 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.evaluation.trajectory.protocol import align, clean_truth
+from improvo.frontend import Frontend
 from improvo.geometry.se3 import rotation_angle_deg
 from improvo.odometry.events import Event
 from improvo.odometry.segments import Segment
@@ -17,7 +18,7 @@ from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import TrackingState
 from improvo.odometry.verdict.verdict import RIGHT as RIGHT_WORD
 from improvo.odometry.visual_odometry import VisualOdometry
-from improvo.types import Features, Float64, Trajectory
+from improvo.types import Float64, Frame, Trajectory
 from robustness_clips import Clip
 
 RIGHT_PERCENT = 3.0  # of the segment's own path
@@ -110,18 +111,18 @@ class Judged:
         }
 
 
-def run_and_judge(clip: Clip, features: list[Features], frontend: Any, seed: int) -> Judged:
+def run_and_judge(clip: Clip, frontend: Frontend, seed: int) -> Judged:
     """Track a clip, and hold what the odometry says against the truth."""
     truth = clean_truth(Trajectory(clip.times, clip.world_from_cam))[0]
     odometry = VisualOdometry(frontend, clip.camera, OdometrySettings(seed=seed))
     restarts = []
     interval = OdometrySettings().health.interval
     before: Trajectory | None = None
-    for number, (one, time, image) in enumerate(zip(features, clip.times.tolist(), clip.images, strict=True)):
+    for number, (time, image) in enumerate(zip(clip.times.tolist(), clip.images, strict=True)):
         known = len(odometry.events)
         if odometry.state is TrackingState.PROVISIONAL and number % interval == 0:
             before = odometry.trajectory  # a check may start it anew
-        odometry.track_features(one, time, image)
+        odometry.track(Frame(number, time, image, f"picture {number}"))
         for event in odometry.events[known:]:
             if event.kind == "contradiction" and "anew" in event.detail and before is not None:
                 running = int(before.segment.max())

@@ -25,12 +25,15 @@ from improvo.improvement.settings import ImproveSettings, SplitSettings, Validat
 from improvo.odometry.settings import OdometrySettings, StartSettings
 from improvo.stability.settings import LabelQualitySettings, LabelSettings
 
+_HELD = ImproveSettings().held
+LABELS_TEACH = replace(_HELD, pairs=replace(_HELD.pairs, whole_frames=0))  # whole frames need none
 SPOILED = "spoiled"  # stands for bundled weights with so much noise that a sixth of the matches is lost
 SETTINGS = ImproveSettings(
     frontend=FrontendSettings(SPOILED, max_keypoints=250),
     # a dozen frames of one wall, by a spoiled network, are no evidence that the odometry is right
     labels=LabelSettings(min_observations=6, quality=LabelQualitySettings(enabled=False)),
     odometry=OdometrySettings(start=StartSettings(max_homography_ratio=0.9)),  # the room is mostly one wall
+    held=LABELS_TEACH,
     split=SplitSettings(0.3),
     validation=ValidationSettings(
         SelfTruthSettings(pairs=6, max_keypoints=250, shuffles=2), gaps=(4, 8), min_pairs=2, calibration_images=2

@@ -22,6 +22,7 @@ from improvo.cli.commands import COMMANDS, leaves, settings_class
 from improvo.cli.flags import comments
 from improvo.cli.main import main
 from improvo.depth.run_settings import DenseRunSettings
+from improvo.files import make_output_folder
 from improvo.simulation import bundled_sequence
 
 ALL = [words for words, _ in leaves()]
@@ -158,7 +159,7 @@ def test_json_is_all_that_is_printed(finished_run: Path, capsys: pytest.CaptureF
 
 
 def test_commands_that_end_in_figures_print_them_as_json(
-    finished_run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    finished_run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     truth = str(finished_run / "trajectory.txt")
     assert main(["evaluate", "trajectory", str(finished_run), truth, "-o", str(tmp_path / "out"), "--json"]) == 0
@@ -172,6 +173,8 @@ def test_commands_that_end_in_figures_print_them_as_json(
     assert json.loads(capsys.readouterr().out) | {"fov": 62.0} == {
         "folders": [room], "frames": 2, "width": 64, "height": 48, "fps": 30.0, "fov": 62.0, "seed": 0,
     }  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    make_output_folder(tmp_path / "demo", "demo")  # as `improvo demo -o demo` does; it is no recording
     assert main(["info", "demo"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "next: `improvo run demo -o out`"
     assert main(["evaluate", "trajectory", str(finished_run), truth, "--quiet"]) == 0

@@ -71,6 +71,7 @@ def test_settings_under_their_former_names_are_read(tmp_path: Path) -> None:
     assert odometry.health.provisional_frames == 9
     assert config.load(RunSettings, path, ["odometry.mode=robust"]).odometry.mode == "robust"
     assert config.from_dict(OdometrySettings, {"initialisation": "paper"}).mode == "paper"
+    assert config.from_dict(OdometrySettings, {"start": {"min_matches": 60, "min_points": 7}}).start.min_points == 7
 
 
 def test_every_former_name_leads_to_a_setting() -> None:

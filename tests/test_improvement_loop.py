@@ -340,10 +340,10 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on_later(
     assert results(out) == results(finished[0].weights.parent)
 
 
-def validation(right: list[float], tracked: int = 100, segments: int = 1) -> Validation:
+def validation(right: list[float], tracked: int = 100, segments: int = 1, matches: int = 100) -> Validation:
     values = {"right_3px": [value / 2 for value in right], "right_8px": right}
     pairs = [[row, row + 30] for row in range(len(right))]
-    scores = GapScores("room", 0, 30, 1.0, pairs, [100] * len(right), values)
+    scores = GapScores("room", 0, 30, 1.0, pairs, [matches] * len(right), values)
     return Validation(100, tracked, segments, 8.0, 0.8, 0.5, {}, (scores,))
 
 
@@ -359,6 +359,8 @@ def test_better_is_more_right_matches_with_odometry_that_is_no_worse() -> None:
     assert is_better(validation(more, tracked=98), start, replace(settings, frames_lost=0.05))
     assert not is_better(validation(more, segments=2), start, settings)
     assert is_better(validation(more, segments=2), start, replace(settings, segments_more=1))
+    assert is_better(validation(more, matches=90), start, settings)  # wrong ones are lost, and some right ones found
+    assert not is_better(validation(more, matches=60), start, settings)  # right ones are lost too
     nothing = validation([0.4, 0.5, 0.6] * 5, tracked=0, segments=0)
     assert is_better(validation(more), nothing, settings)  # one segment is no break more than none
     assert not is_better(validation(more, segments=2), nothing, settings)

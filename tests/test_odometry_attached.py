@@ -14,7 +14,7 @@ from improvo.odometry.view import View
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.tracking.connect import TrackChain
 from improvo.tracking.matching import match_units, unit_descriptors
-from improvo.types import Features, Float64
+from improvo.types import Features, Float64, Frame, Mask, UInt8
 
 LOGO = (200.0, 20.0, 310.0, 110.0)  # left, top, right, bottom: an eighth of the picture
 
@@ -125,6 +125,45 @@ def test_odometry_with_a_logo_is_right_and_says_so() -> None:
         said = [event for event in odometry.events if event.kind == "attached"]
         assert bool(said) is enabled
     assert errors[True] < 2.0 < errors[False], errors
+
+
+class FewKeypoints:
+    """A frontend that keeps its strongest keypoints, and a logo has the strongest; the picture's number is in it."""
+
+    name = "few"
+
+    def __init__(self, seen: list[Features], budget: int) -> None:
+        self._seen, self._budget = seen, budget
+
+    def __call__(self, image: UInt8, mask: Mask | None = None) -> Features:
+        features = self._seen[int(image[0, 0])]
+        if mask is not None:
+            x, y = np.rint(features.keypoints).astype(int).T
+            features = features.take(mask[np.clip(y, 0, CAMERA.height - 1), np.clip(x, 0, CAMERA.width - 1)])
+        return features.take(np.argsort(-features.scores, kind="stable")[: self._budget])
+
+
+class FewKeypointsEverywhere(FewKeypoints):
+    def __call__(self, image: UInt8) -> Features:  # type: ignore[override]  # of a user who knows no masks
+        return super().__call__(image)
+
+
+def test_a_frontend_whose_keypoints_a_logo_takes_is_asked_for_more_of_the_world() -> None:
+    truth = hand_motion(60, step=0.03)
+    features = [with_logo(each, number, count=300) for number, each in enumerate(seen(truth))]
+    strong = [
+        Features(each.keypoints, each.descriptors, np.linspace(1, 0, len(each), dtype=np.float32)) for each in features
+    ]
+    found = {}
+    for frontend in (FewKeypoints(strong, 345), FewKeypointsEverywhere(strong, 345)):
+        with VisualOdometry(frontend, CAMERA) as odometry:  # type: ignore[arg-type]
+            for number in range(60):
+                image = np.full((CAMERA.height, CAMERA.width), number, np.uint8)
+                odometry.track(Frame(number, number / 30, image, str(number)))
+        path = odometry.trajectory
+        right = path.valid.sum() > 50 and error_percent(path.camera_centers[path.valid], truth[path.valid, :3, 3]) < 3.0
+        found[type(frontend)] = bool(right)
+    assert found == {FewKeypoints: True, FewKeypointsEverywhere: False}
 
 
 def test_tracks_of_a_logo_are_no_overlap_for_a_start() -> None:

@@ -62,3 +62,11 @@ def test_a_wrong_turn_is_contradicted() -> None:
     truth = hand_motion(40)
     extra = se3.rigid(se3.so3_exp(np.radians(1.5) * np.arange(40)[:, None] * [0.0, 0.0, 1.0]), np.zeros((40, 3)))
     assert alarms(truth @ extra, truth)
+
+
+def test_a_fresh_pose_that_turned_far_otherwise_decides_nothing() -> None:
+    """Repeated texture gives such poses, and tracks from frame to frame would have noticed the turn."""
+    truth = hand_motion(40, step=0.06)
+    turned = truth.copy()
+    turned[:, :3, :3] = turned[:, :3, :3] @ se3.so3_exp(np.arange(40)[:, None] * np.array([0.0, 0.05, 0.0]))
+    assert alarms(truth, turned) == []

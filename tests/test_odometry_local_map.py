@@ -130,3 +130,16 @@ def test_points_not_seen_for_long_are_not_searched_for() -> None:
         local_map.localise(views[20], views[19])
         observed.append(len(views[20].observed))
     assert observed[1] < observed[0]
+
+
+@pytest.mark.parametrize(("frames", "reached"), [(1, False), (8, True)])
+def test_a_place_that_the_camera_cannot_have_reached_is_another_that_looks_alike(
+    mapped: tuple[LocalMap, list[View]], frames: int, reached: bool
+) -> None:
+    """Seventeen steps back within one frame is impossible, and within eight it is not."""
+    local_map, views = mapped
+    seen = observe(room(), TRUTH[2], seed=77)
+    back = views_of([seen])[0]
+    back.frame_index, back.tracks = 19 + frames, back.tracks + 10**6
+    local_map.localise(back, views[19])
+    assert (back.cam_from_world is not None) is reached

@@ -312,3 +312,5 @@ def test_improvement_is_told_with_its_setbacks(tmp_path: Path) -> None:
     pair = text[text.index('<div class="pair">') :]
     assert pair.index("before: matches") < pair.index("round 2: matches") < pair.index("</div>")
     assert "&lt;one&gt;" in text
+    write_improvement_page(tmp_path / "none.html", "Improvement", "", measures, rounds, best=0)
+    assert "round 2, not kept: matches" in (tmp_path / "none.html").read_text()

@@ -215,6 +215,73 @@ def test_pairs_are_moved_to_where_the_pictures_agree() -> None:
     assert off[1] < 0.6 * off[0]
 
 
+def test_whole_frames_are_shown_as_they_are_and_keypoints_without_a_partner_are_wrong_ones() -> None:
+    room = posed_room()
+    asked: list[int] = []
+
+    def corner_of_each_cell(views: Any, layers: int = 0) -> Any:
+        asked.append(len(views))
+        logits, stem = no_keypoints(views)
+        logits[:, 3 * 8 + 5] = 9.0
+        return logits, stem
+
+    pairs = replace(SMALL.pairs, whole_frames=1, whole_points=200, alone=40, largest_gap=6.0)
+    batches = DevicePairs(
+        Pictures((photographs(),)), [room], replace(SMALL, pairs=pairs), corner_of_each_cell, None, CPU
+    )
+    width, height = SIZE[0] // 8 * 8, SIZE[1] // 8 * 8
+    shown, lonely = set(), 0
+    for step in range(12):
+        batch = batches[step]
+        assert batch["images"].shape == (2, 1, height, width)
+        for image in batch["images"][:, 0].numpy():
+            shown.add(next(n for n, picture in enumerate(room.pictures) if (picture[:height, :width] == image).all()))
+        valid, negative = batch["valid"][0], batch["negative"][0]
+        assert valid.shape == (240,)
+        assert not valid[200:].any()
+        assert (negative[:200] == valid[:200]).all()
+        a = grey_at(batch["images"][0, 0], batch["points_a"][0][valid])
+        b = grey_at(batch["images"][1, 0], batch["points_b"][0][valid])
+        assert np.corrcoef(a, b)[0, 1] > 0.9
+        for name, wrong in (("points_a", negative), ("points_b", batch["negative_b"][0])):
+            points = batch[name][0][wrong & ~valid]
+            lonely += len(points)
+            assert torch.equal(points % 8, torch.tensor([5.0, 3.0]).expand_as(points))  # keypoints
+    assert lonely > 10
+    assert len(asked) == len(shown)  # each frame was looked at once
+    again = batches[3]
+    forgetful = DevicePairs(
+        Pictures(()), [room], replace(SMALL, pairs=replace(pairs, frames_remembered=1)), corner_of_each_cell, None, CPU
+    )[3]
+    assert all(torch.equal(again[name], forgetful[name]) for name in again)
+
+
+def test_where_no_frames_overlap_and_in_the_control_pairs_are_views() -> None:
+    pairs = replace(SMALL.pairs, whole_frames=1)
+    settings = replace(SMALL, pairs=pairs)
+    control = replace(SMALL, pairs=replace(pairs, two_frames=False))
+    for chosen, posed in ((settings, []), (control, [posed_room()])):
+        batches = DevicePairs(Pictures((photographs(),)), posed, chosen, no_keypoints, None, CPU)
+        assert batches[0]["images"].shape == (8, 1, 96, 128)
+
+
+def test_keypoints_that_the_other_view_does_not_show_lie_outside_of_it() -> None:
+    settings = replace(SMALL, pairs=replace(SMALL.pairs, alone=30, posed_share=0.0, two_frames=False))
+    source = photographs(1)
+    batches = DevicePairs(Pictures((source,)), [], settings, no_keypoints, None, CPU)
+    generator = np.random.default_rng([settings.optimiser.seed, 0, 0])
+    generator.integers(2**62)
+    plan = batches._plan(generator, 4)
+    batch = batches[0]
+    alone = {"points_a": batch["negative"] & ~batch["valid"], "points_b": batch["negative_b"] & ~batch["valid"]}
+    assert all(rows.any() and not rows[:, :64].any() for rows in alone.values())
+    for pair in range(4):
+        a, b = plan.view_from_picture[pair], plan.view_from_picture[4 + pair]
+        for name, motion in (("points_a", b @ np.linalg.inv(a)), ("points_b", a @ np.linalg.inv(b))):
+            elsewhere = warp_points(motion, batch[name][pair][alone[name][pair]].numpy().astype(np.float64))
+            assert not inside(elsewhere, 128, 96, margin=-8.0).any()
+
+
 def test_frames_that_share_nothing_make_no_pair() -> None:
     room = posed_room(3)
     apart = replace(room, world_from_cam=room.world_from_cam + 10 * np.eye(4, k=3) * np.arange(3)[:, None, None])
@@ -330,6 +397,8 @@ def test_a_pack_gives_back_what_was_packed(tmp_path: Path) -> None:
         lambda: HeldSettings(optimiser=OptimiserSettings(batch_size=6, workers=0)),
         lambda: HeldSettings(optimiser=OptimiserSettings(batch_size=8, workers=1)),
         lambda: HeldSettings(stability_every=0),
+        lambda: HeldSettings(scale=0.0),
+        lambda: DevicePairSettings(whole_frames=-1),
     ],
 )
 def test_settings_out_of_range_are_refused(make: Any) -> None:
@@ -364,6 +433,19 @@ def test_tracks_take_turns_with_dense_pairs_and_are_held_to_the_same_teachers() 
     network = HeldStage(SuperPoint(replace(ARCHITECTURES["superpoint-small"], stability=True)), settings)
     batch = {**odd, "images": odd["images"].float() / 255}
     assert torch.isfinite(network.losses(batch)["loss"])
+
+
+def test_statistics_stay_where_they_are_fixed(tmp_path: Path) -> None:
+    start = find_weights("superpoint-small")
+    before = load_weights(start).tensors
+    for fixed in (True, False):
+        out = tmp_path / str(fixed)
+        settings = replace(SMALL, fixed_statistics=fixed)
+        train_held(Pictures((photographs(),)), [posed_room()], settings, out, start, progress=False)
+        after = load_weights(out / "weights.safetensors").tensors
+        moved = {name for name, values in before.items() if not np.array_equal(values, after[name])}
+        assert any(".running_" in name for name in moved) != fixed
+        assert any(name.endswith("norm.weight") for name in moved)
 
 
 @pytest.mark.parametrize("frozen", [4, 8])

@@ -34,6 +34,14 @@ FORMER_NAMES: dict[str, dict[str, str]] = {
     "pairs": {"rehearsed_share": "replay_share"},
 }
 
+# Settings that are no more, since their values followed from others; files that have them stay readable.
+FORMER_SETTINGS: dict[str, frozenset[str]] = {
+    "start": frozenset({"min_common_tracks", "min_matches", "min_off_plane_points"}),
+    "window": frozenset({"keyframe_interval"}),
+    "loss": frozenset({"min_inlier_share"}),
+    "health": frozenset({"min_inliers"}),
+}
+
 
 def to_dict(settings: Any) -> dict[str, Any]:
     """The settings as plain nested dictionaries, tuples as lists, ready for YAML or JSON."""
@@ -129,7 +137,7 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings", bas
 
 
 def with_present_names(values: Any, section: str = "") -> Any:
-    """Nested dictionaries of settings with every former name replaced by the present one (see FORMER_NAMES).
+    """Nested dictionaries of settings as they are called now (see FORMER_NAMES), without FORMER_SETTINGS.
 
     Args:
         values: of one section, or of several as nested dictionaries.
@@ -139,6 +147,8 @@ def with_present_names(values: Any, section: str = "") -> Any:
         return values
     renamed = {}
     for key, value in values.items():
+        if key in FORMER_SETTINGS.get(section, ()):
+            continue
         present = _present_name(section, key)
         if present == key or present not in values:
             renamed[present] = with_present_names(value, present)

@@ -37,12 +37,11 @@ def run(arguments: argparse.Namespace) -> int:
         _do([*map(str, words), *(["--quiet"] if arguments.quiet else [])])
 
     make_output_folder(arguments.output, "demo")
-    recording = bundled_sequence()
+    recording = "demo"
     before, improved, after = (arguments.output / name for name in ("run", "improve", "run-improved"))
-    truth = recording / "groundtruth.txt"
-    say(f"A simulated room of 140 frames, with its true poses: {recording}")
+    say(f"A simulated room of 140 frames, with its true poses: {bundled_sequence()}")
     do("run", recording, "-o", before, "--frontend", arguments.frontend)
-    do("evaluate", "trajectory", before / "trajectory.txt", truth)
+    do("evaluate", "trajectory", before, recording)
     do("show", "map", before)
     do("show", "tracks", before)
     do("show", "labels", before)
@@ -57,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     options = ["--control", "--set", "split.share=0.4"]  # of so short a recording, for pairs 30 frames apart
     do("improve", recording, "-o", improved, "--frontend", arguments.frontend, "--steps", arguments.steps, *options)
     do("run", recording, "-o", after, "--frontend", improved / "weights.safetensors")
-    do("evaluate", "trajectory", after / "trajectory.txt", truth)
+    do("evaluate", "trajectory", after, recording)
     next_step(f"open {improved / 'report.html'}, {before / 'report.html'} and the pictures in {before / 'pictures'}")
     return 0
 

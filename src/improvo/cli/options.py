@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from improvo import config
 from improvo.cli.flags import add_setting
 from improvo.errors import InputError
+from improvo.files import MARKER
 from improvo.presets import preset, presets
 from improvo.sequences.base import SequenceSettings
 
@@ -79,9 +80,10 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def recording_path(text: str) -> Path:
-    """The path of a recording; `demo`, where there is no such path, is the bundled one."""
+    """The path of a recording; `demo` is the bundled one, unless a recording has that name."""
     path = Path(text)
-    if text != "demo" or path.exists():
+    # `improvo demo -o demo` leaves a folder of that name, which is none
+    if text != "demo" or (path.exists() and not (path / MARKER).is_file()):
         return path
     from improvo.simulation import bundled_sequence
 

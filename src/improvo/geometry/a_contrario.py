@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 
+SIGNIFICANT = -6.0  # log10 of the number of false alarms, at most, of an agreement that is none of chance
 _LN10 = math.log(10.0)
 
 

@@ -9,13 +9,14 @@ from pathlib import Path
 
 from improvo.errors import OutputError
 from improvo.improvement.recipe import steps_of
-from improvo.improvement.settings import METRIC, TRACKS, ImproveSettings
+from improvo.improvement.settings import HELD, METRIC, TRACKS, ImproveSettings
 from improvo.terminal import counted
 
 # seconds on two calm cores with `superpoint-small`; `superpoint` takes about four times as long where it trains
 _SECONDS_PER_FRAME = 0.12  # of odometry, at 640x480
 _SECONDS_PER_DEPTH = 0.35
-_SECONDS_PER_STEP = 0.35  # one core of an AMD EPYC with AVX-512 BF16, 2026-11-28; in float32 two to three times as long
+_SECONDS_PER_STEP = 0.2  # one core of an AMD EPYC with AVX-512 BF16, 2026-11-28; in float32 two to three times as long
+_MIB_PER_REMEMBERED = 2.1  # frame of 640x480, with what is held to
 _SECONDS_PER_PAIR = 0.08
 _GAPS = 3  # between the frames of a pair
 _SECONDS_PER_FRAME_PAIR = 0.02  # of the recipe `metric`, beside the features of its frames
@@ -95,13 +96,18 @@ def estimate(
     if settings.recipe == METRIC:
         each = training * costs.frame + steps * _SECONDS_PER_FRAME_PAIR
     # of a whole recording the reference has the labels of the start already
-    whole = 1 if settings.recipe == TRACKS or recordings else 2
-    frames = whole * (training + held_back) + (rounds - 1) * training + trainings * held_back
+    labeled = training if settings.teaches_labels else 0
+    again = 0 if settings.recipe == TRACKS or recordings else labeled + held_back
+    frames = training + held_back + again + (rounds - 1) * labeled + trainings * held_back
     pairs = max(recordings, 1) * min(settings.validation.matches.pairs, held_back // max(recordings, 1))
     validations = (1 + trainings) * pairs * _GAPS * costs.pair
     others = deep * costs.depth + trainings * each + validations
     small = min(pixels, settings.held.longer_side**2 * 3 // 4)
-    memory = _TORCH_MIB + min(training, reference.most_training) * (2.5 * small + 4 * pixels / 4) / _MIB
+    taught = min(training, reference.most_training)
+    memory = _TORCH_MIB + taught * (2.5 * small + 4 * pixels / 4) / _MIB
+    if settings.recipe == HELD and settings.held.pairs.whole_frames:
+        remembered = min(taught, settings.held.pairs.frames_remembered)
+        memory += remembered * _MIB_PER_REMEMBERED * small / (640 * 480)
     disk = 60 + 0.1 * (training + held_back) * (1 + trainings) + deep * pixels / 4 * 1.3 / _MIB + 12 * trainings
     return Estimate((frames * costs.frame + others) / 60, memory, disk, steps, frames, others / 60)
 

@@ -107,7 +107,8 @@ def improve(
             teacher = result.candidates[result.best]
             candidate = folder.round(number)
             if not candidate.validation.is_file():
-                loop.label(teacher, split.training)
+                if settings.teaches_labels:
+                    loop.label(teacher, split.training)
                 loop.train(candidate, number, teacher, split.training, teaching)
             validation = loop.validate(candidate, split.held_back, judging)
             better = is_better(validation, result.validations[result.best], settings.validation)

@@ -13,7 +13,7 @@ from improvo.improvement.folder import Candidate
 from improvo.improvement.progress import gain_words
 from improvo.improvement.settings import ImproveSettings, ValidationSettings
 from improvo.improvement.split import Part, Split
-from improvo.improvement.validation import Validation, gain, loose, rule, strict
+from improvo.improvement.validation import Validation, found, gain, loose, rule, strict
 from improvo.labeling.store import DONE, read_records
 from improvo.report.improvement_page import Measure, Round, write_improvement_page
 from improvo.sequences import open_sequence
@@ -45,7 +45,7 @@ def write_report(
     """
     start = validations[0]
     rounds = [
-        _round(candidate, validation, split, settings, pictures=number in (0, best))
+        _round(candidate, validation, split, settings, pictures=number in (0, best or len(candidates) - 1))
         for number, (candidate, validation) in enumerate(zip(candidates, validations, strict=True))
     ]
     if control:
@@ -160,10 +160,15 @@ def _gains(judged: Sequence[tuple[Candidate, Validation]], settings: ValidationS
     (_, start), *others = judged
     rows = [["right matches", "all gaps", *(start.gap_words(level) for level in start.levels)]]
     for candidate, validation in others:
-        names, limits = (loose(settings.matches), strict(settings.matches)), settings.matches.right_px[::-1]
-        for name, limit in zip(names, limits, strict=True):
+        narrow, wide = settings.matches.right_px
+        names = {
+            loose(settings.matches): f"share, {wide:g} px",
+            strict(settings.matches): f"share, {narrow:g} px",
+            found(settings.matches): f"number, {wide:g} px",
+        }
+        for name, what in names.items():
             gains = (gain(validation, start, name, settings.matches, level) for level in (None, *start.levels))
-            rows.append([f"{candidate.name}, {limit:g} px", *(found.cell for found in gains)])
+            rows.append([f"{candidate.name}, {what}", *(one.cell for one in gains)])
     return rows
 
 

@@ -89,8 +89,8 @@ class ImproveSettings:
     labels: LabelSettings = field(default_factory=LabelSettings)
     split: SplitSettings = field(default_factory=SplitSettings)
     reference: ReferenceSettings = field(default_factory=ReferenceSettings)
-    # held: descriptors from dense pairs and tracks, the other heads held to the start's. metric: a linear map of the
-    # descriptors from dense pairs, in closed form. tracks: all heads from tracks
+    # held: descriptors from dense pairs of frames, the other heads held to the start's. metric: a linear map of the
+    # descriptors from such pairs, in closed form. tracks: all heads from tracks
     recipe: str = HELD
     control: bool = False  # also train, from the same start, by homographies of the same frames alone, and show it
     minutes: float = 0.0  # that training may take in each round; 0: as many steps as the following say
@@ -98,9 +98,12 @@ class ImproveSettings:
     steps_per_frame: float = 3.0
     held: HeldSettings = field(
         default_factory=lambda: HeldSettings(
-            pairs=DevicePairSettings(group=1),
-            optimiser=OptimiserSettings(  # 1200 steps take 7 minutes on a core with bfloat16
-                steps=1200, batch_size=2, learning_rate=5e-4, decay_steps=400, warmup_steps=50, workers=0
+            frozen_layers=4,  # whose features of a frame are remembered
+            fixed_statistics=True,
+            scale=28.0,
+            pairs=DevicePairSettings(group=1, whole_frames=1, alone=250, keypoint_share=0.7),
+            optimiser=OptimiserSettings(  # 1200 steps take 4 minutes on a core with bfloat16
+                steps=1200, batch_size=2, learning_rate=3e-4, decay_steps=400, warmup_steps=50, workers=0
             ),
         )
     )
@@ -120,6 +123,11 @@ class ImproveSettings:
                 raise ConfigError(f"{name}={getattr(self, name):g}: must be 0 or more")
         if self.minutes and self.recipe != HELD:
             raise ConfigError("minutes: only the recipe `held` chooses its steps by time; give steps instead")
+
+    @property
+    def teaches_labels(self) -> bool:
+        """Whether a round trains with the labels of the training part; the others teach depth and poses."""
+        return self.recipe == TRACKS or (self.recipe == HELD and not self.held.pairs.whole_frames)
 
     def run_settings(self, sequence: SequenceSettings, frontend: FrontendSettings) -> RunSettings:
         """The odometry's settings for some frames and a frontend."""

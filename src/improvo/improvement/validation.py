@@ -128,6 +128,11 @@ def strict(settings: SelfTruthSettings) -> str:
     return f"right_{settings.right_px[0]:g}px"
 
 
+def found(settings: SelfTruthSettings) -> str:
+    """How many matches of a pair are right within the wider limit: a share also rises where wrong ones are lost."""
+    return f"found_{settings.right_px[1]:g}px"
+
+
 def gain(
     candidate: Validation,
     before: Validation,
@@ -140,21 +145,21 @@ def gain(
 
     Args:
         candidate, before: measured on the same pairs.
-        name: of the value.
+        name: of the value, or `found(settings)`.
         settings: of the intervals.
         level: of the gap; all gaps together, each with the same weight, where it is None.
         earlier: a recording of an earlier run, in place of those of this one.
     """
     first, second = (
         [
-            _only(scores.scores(), name)
+            _only(scores.scores(), name, settings)
             for scores in validation.scores
             if level in (None, scores.level) and earlier == (scores.recording if scores.earlier else "")
         ]
         for validation in (before, candidate)
     )
-    found = compare_gaps(first, second, settings)[name]
-    return Gain(found["first"], found["second"], *found["interval"])
+    compared = compare_gaps(first, second, settings)[name]
+    return Gain(compared["first"], compared["second"], *compared["interval"])
 
 
 def rule(settings: ValidationSettings) -> str:
@@ -162,8 +167,9 @@ def rule(settings: ValidationSettings) -> str:
     return (
         f"A frontend is better than the best one before it if a larger share of its matches is right within "
         f"{settings.matches.right_px[1]:g} pixels on the frames held back, at all gaps together and by more than "
-        f"chance (95 % interval), and the odometry is not worse with it: it loses no more than "
-        f"{100 * settings.frames_lost:g} % of the frames that it tracked with the other, and breaks no more often. "
+        f"chance (95 % interval), the number of right ones is not less by more than chance, and the odometry is not "
+        f"worse with it: it loses no more than {100 * settings.frames_lost:g} % of the frames that it tracked with the "
+        f"other, and breaks no more often. "
         f"No recording of an earlier run may be worse by more than chance."
     )
 
@@ -180,7 +186,8 @@ def is_better(candidate: Validation, best: Validation, settings: ValidationSetti
     whole = candidate.segments <= max(best.segments, 1) + settings.segments_more  # none where nothing was tracked
     name = loose(settings.matches)
     remembered = all(gain(candidate, best, name, settings.matches, None, one).high >= 0 for one in best.earlier)
-    return kept and whole and remembered and gain(candidate, best, name, settings.matches).low > 0
+    no_fewer = gain(candidate, best, found(settings.matches), settings.matches).high >= 0
+    return kept and whole and remembered and no_fewer and gain(candidate, best, name, settings.matches).low > 0
 
 
 def summary(validation: Validation, start: Validation, settings: ValidationSettings) -> dict[str, float]:
@@ -213,29 +220,30 @@ def read_validation(path: Path) -> Validation:
     check_format(values.pop(FORMAT_KEY, None), path, mend)
     error = values.get("error", 0.0)
     try:
-        found = config.from_dict(Validation, {**values, "error": float("nan") if error is None else error})
-        if not (_belongs_together(found) and {"label", "evaluate"} <= found.seconds.keys()):
+        read = config.from_dict(Validation, {**values, "error": float("nan") if error is None else error})
+        if not (_belongs_together(read) and {"label", "evaluate"} <= read.seconds.keys()):
             raise ConfigError("values that do not belong together")
     except ConfigError:
         raise InputError(f"{path}: is damaged; {mend}") from None
-    return found
+    return read
 
 
-def _belongs_together(found: Validation) -> bool:
+def _belongs_together(read: Validation) -> bool:
     """Whether the numbers are finite, and every pair has its values."""
-    numbers = [found.track_length, found.stable_share, *found.truth.values()]
-    for scores in found.scores:
+    numbers = [read.track_length, read.stable_share, *read.truth.values()]
+    for scores in read.scores:
         columns = list(scores.values.values())
         numbers += [scores.seconds, *(value for column in columns for value in column)]
         lengths = {len(scores.pairs), len(scores.matches), *map(len, columns)}
-        named = scores.values.keys() == found.scores[0].values.keys()
+        named = scores.values.keys() == read.scores[0].values.keys()
         if len(lengths) > 1 or not scores.pairs or not named or any(len(pair) != 2 for pair in scores.pairs):
             return False
-    return bool(found.scores) and bool(np.isfinite(numbers).all())
+    return bool(read.scores) and bool(np.isfinite(numbers).all())
 
 
-def _only(scores: PairScores, name: str) -> PairScores:
-    return PairScores(scores.gap, scores.pairs, scores.matches, {name: scores.values[name]})
+def _only(scores: PairScores, name: str, settings: SelfTruthSettings) -> PairScores:
+    values = scores.matches * scores.values[loose(settings)] if name == found(settings) else scores.values[name]
+    return PairScores(scores.gap, scores.pairs, scores.matches, {name: values})
 
 
 def _range(values: Sequence[float]) -> str:

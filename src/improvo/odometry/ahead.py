@@ -7,10 +7,9 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
+from improvo.odometry.alarms.world_keypoints import AHEAD
 from improvo.odometry.visual_odometry import MatchedFeatures
 from improvo.types import Features, Frame
-
-_AHEAD = 2  # frames; more cost memory and save no time
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ def detected_ahead(
         return DetectedFrame(frame, matched, read - start, detected - read, time.perf_counter() - detected)
 
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="detect") as worker:
-        pending: list[Future[DetectedFrame | None]] = [worker.submit(next_frame) for _ in range(_AHEAD)]
+        pending: list[Future[DetectedFrame | None]] = [worker.submit(next_frame) for _ in range(AHEAD)]
         try:
             while (detected := pending.pop(0).result()) is not None:
                 pending.append(worker.submit(next_frame))

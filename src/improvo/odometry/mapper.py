@@ -10,7 +10,7 @@ from improvo.odometry.mapping.local_map import LocalMap
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import TrackingState
-from improvo.odometry.view import View
+from improvo.odometry.view import Mask, View
 
 
 class Mapper(ABC):
@@ -48,6 +48,10 @@ class Mapper(ABC):
     @abstractmethod
     def state(self) -> TrackingState:
         """What the mapper is doing."""
+
+    def dispensable_pixels(self, view: View) -> Mask | None:
+        """(H, W) what need have no keypoints, since it moves with the camera; None where few of a view's are there."""
+        return None
 
     @abstractmethod
     def track(self, view: View) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from improvo.geometry.camera import Camera
 from improvo.odometry.alarms.attached import AttachedDetector
-from improvo.odometry.alarms.focal_change import focal_change
+from improvo.odometry.alarms.focal_change import LensWatch
 from improvo.odometry.alarms.health import HealthCheck
 from improvo.odometry.events import EventLog
 from improvo.odometry.mapper import Mapper
@@ -19,11 +19,10 @@ from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import StateMachine, TrackingState
 from improvo.odometry.verdict.judging import SegmentJudge
-from improvo.odometry.view import NO_POINT, View
+from improvo.odometry.view import Mask, View
 from improvo.types import Float64
 
 _CARRIED = 0.2  # share of the observations that turned out to move with the camera; with more the map is wrong
-_SAME_LENS = 0.05  # relative change of the focal length that is none
 _FIRST_COOLDOWN = 3  # frames after a costly failure to start; it doubles with each further one
 _LOST = "lost"  # why a segment ended
 
@@ -45,7 +44,7 @@ class RobustMapper(Mapper):
         self._cooldown = 0  # frames to wait before the next try to start
         self._costly_failures = 0  # since the last map
         self._worlds = 0  # maps started
-        self._focal_factor = 1.0  # of the lens now, times what the camera says
+        self._lens = LensWatch(camera, settings.window.max_error, settings.seed)
         self._carried = False  # a large part of the map has turned out to move with the camera
         self._window = SlidingWindow(settings.window, camera.width)
         self._health = HealthCheck(camera, settings, descriptor_distance)
@@ -59,6 +58,10 @@ class RobustMapper(Mapper):
         """What the mapper is doing."""
         return self._states.state
 
+    def dispensable_pixels(self, view: View) -> Mask | None:
+        """(H, W) what need have no keypoints, since it moves with the camera; None where few of a view's are there."""
+        return self._attached.dispensable(view)
+
     def track(self, view: View) -> None:
         """One frame: localise, triangulate, adjust the window, check, slide."""
         newly_attached = self._attached.observe(view)
@@ -69,7 +72,8 @@ class RobustMapper(Mapper):
             return
         if newly_attached and self._leave_out_attached(view, [*self._map.history, *self._buffer]) > _CARRIED:
             self._carried = True
-        if self._zoomed(self._map, view):
+        if self._lens.changed(self._window.newest, view, self._map.store.xyz):
+            self._events.focal_length(view.frame_index, self._lens.factor, "the segment ends")
             self._end_segment("the focal length changed")
             self._initialise(view)
             return
@@ -133,9 +137,9 @@ class RobustMapper(Mapper):
         self._worlds += 1
         self._states.map_started()
         self._events.segment_started(self._buffer[0].frame_index, self._result.running_segment)
-        if self._focal_factor != 1.0:
-            self._events.focal_length(self._buffer[0].frame_index, self._focal_factor, "the segment is doubtful")
-            self._judge.alarm(f"the focal length is about {self._focal_factor:.2f} times that of the camera as given")
+        if self._lens.factor != 1.0:
+            self._events.focal_length(self._buffer[0].frame_index, self._lens.factor, "the segment is doubtful")
+            self._judge.alarm(f"the focal length is about {self._lens.factor:.2f} times that of the camera as given")
         self._result.begin_segment()
         self._result.give_up(each for each in self._buffer if each.cam_from_world is None)
         self._health = HealthCheck(self._camera, self._settings, self._descriptor_distance)
@@ -198,29 +202,10 @@ class RobustMapper(Mapper):
             for view, cam_from_world in self._window.take_final():
                 self._finalise(self._map, view, cam_from_world)
 
-    def _zoomed(self, local_map: LocalMap, view: View) -> bool:
-        """Whether the lens changed just before a view. What it is now holds for all that follows, until it changes."""
-        before, settings = self._window.newest, self._settings
-        if before.frame_index != view.frame_index - 1:
-            return False
-        change = focal_change(before, view, local_map.store.xyz, self._camera, settings.window.max_error, settings.seed)
-        if change == 1.0:
-            return False
-        self._focal_factor *= change
-        if abs(self._focal_factor - 1.0) < _SAME_LENS:
-            self._focal_factor = 1.0
-        self._events.focal_length(view.frame_index, self._focal_factor, "the segment ends")
-        return True
-
     def _leave_out_attached(self, view: View, views: list[View]) -> float:
         """Mark earlier views anew, and drop what they observe there; returns its share of all that they observed."""
-        self._attached.mark(views)
         self._events.attached(view.frame_index, float(view.attached.mean()) if len(view) else 0.0)
-        observed = [each.points >= 0 for each in views]
-        dropped = sum(int((each.attached & seen).sum()) for each, seen in zip(views, observed, strict=True))
-        for each in views:
-            each.points[each.attached] = NO_POINT
-        return dropped / max(sum(int(seen.sum()) for seen in observed), 1)
+        return self._attached.drop(views)
 
     def _start_anew(self, view: View, by: str) -> None:
         """The map is wrong: a provisional one starts anew over all its frames, another one over its last frames."""

@@ -7,7 +7,6 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from improvo.errors import InputError
 from improvo.files import make_output_folder, write_json
 from improvo.formats import FORMAT, FORMAT_KEY
 from improvo.frontend import Frontend
-from improvo.frontend.masking import features_of
 from improvo.frontend.registry import frontend_from
 from improvo.geometry.ransac import robust_solver
 from improvo.geometry.trajectory_files import write_trajectory
@@ -138,7 +136,7 @@ def _track_all(
     """All frames in order; returns the recording's index of each processed one, and whether it was interrupted."""
     processed: list[int] = []
     try:
-        for detected in detected_ahead(sequence, partial(features_of, frontend), odometry.match):
+        for detected in detected_ahead(sequence, odometry.detect, odometry.match):
             with interrupts_wait():
                 start = time.perf_counter()
                 tracked = odometry.track_matched(detected.matched, detected.frame.time, detected.frame.image)

@@ -31,17 +31,15 @@ class MatchingSettings:
 class StartSettings:
     """When two views are good enough to start a map (mode `robust`)."""
 
-    min_common_tracks: int = 30  # that the earliest view of a pair shares with the newest
-    min_matches: int = 60  # of the pair, matched afresh
+    min_points: int = 30  # of a map, with parallax; as many tracks in common, and twice as many matches, are needed
     min_rotation_residual: float = 2.0  # pixels, median that the best pure rotation leaves of the matches
     max_buffered: int = 300  # frames in the initialisation buffer; the oldest leaves it without a pose
     epipolar_error: float = 1.0  # pixels, RANSAC threshold of the essential matrix and of the homography
     max_homography_ratio: float = 0.7  # homography inliers over essential inliers; more is too little parallax, unless
-    min_off_plane_points: int = 60  # so many essential inliers are no homography inliers, or
+    # twice min_points of the essential inliers are no homography inliers, or
     plane_ratio: float = 0.8  # the ratio is at least this: then the scene is one plane, and its homography is used
     max_second_motion: float = 0.5  # spread over the picture of another motion, as a share of the first one's
     min_parallax_deg: float = 1.0  # of a point, for it to count
-    min_points: int = 30  # with that parallax
     min_inlier_share: float = 0.3  # essential inliers of the matches
     max_mean_error: float = 1.2  # pixels, after adjustment and pruning
     max_lost: int = 4  # buffered frames in a row, such as black ones, that may stay without a pose
@@ -52,12 +50,11 @@ class StartSettings:
 class WindowSettings:
     """Which poses the window adjusts."""
 
-    recent: int = 15  # last consecutive frames, free
+    recent: int = 15  # last consecutive frames, free; one of them at least is a keyframe
     keyframes: int = 15  # older keyframes, free
     fixed: int = 30  # still older keyframes; their poses stay, their observations count
     keyframe_motion: float = 0.05  # median pixel motion since the last keyframe, as a share of the image width
     keyframe_shared: float = 0.6  # or: share of the last keyframe's map points still seen
-    keyframe_interval: int = 15  # or: frames since the last keyframe
     max_error: float = 3.0  # pixels; observations over it are dropped, and the window is solved again
     paper_poses: int = 30  # N_last, of the mode `paper`
 
@@ -74,7 +71,6 @@ class TrackingLossSettings:
 
     min_inliers: int = 12
     wrong_share: float = 0.1  # of wrong matches that agree with a wrong pose, where the scene repeats or is mirrored
-    min_inlier_share: float = 0.1
     max_lost_frames: int = 10  # more frames than this without a pose end the segment
 
 
@@ -85,8 +81,8 @@ class HealthSettings:
     interval: int = 5  # frames between two checks
     gaps: tuple[int, ...] = (3, 6, 12)  # frames between the two views of a check
     epipolar_error: float = 1.5  # pixels
-    min_inliers: int = 30  # of the two views' own essential matrix; fewer say nothing
-    min_inlier_share: float = 0.15  # of their matches
+    min_inlier_share: float = 0.4  # of the two views' own essential matrix; fewer may agree by repeated texture
+    max_turn_deg: float = 5.0  # between both rotations; one farther off is of a mover or of repeated texture
     rounds: int = 3  # consecutive checks that are evaluated together
     min_evidence: int = 100  # inliers in all of them; fewer decide nothing
     min_agreement: float = 0.85  # right maps stay over 0.90, wrong ones fall under 0.80

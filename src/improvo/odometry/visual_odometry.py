@@ -9,9 +9,9 @@ from types import TracebackType
 import numpy as np
 
 from improvo.frontend import Frontend
-from improvo.frontend.masking import features_of
 from improvo.frontend.registry import CLASSICAL
 from improvo.geometry.camera import Camera
+from improvo.odometry.alarms.world_keypoints import WorldKeypoints
 from improvo.odometry.checks import OneThread, check_features, check_frame, check_time
 from improvo.odometry.events import Event, EventLog
 from improvo.odometry.mapper import Mapper
@@ -77,7 +77,7 @@ class VisualOdometry:
         use_stability: bool = True,
         on_final: Callable[[FinalView], None] | None = None,
     ) -> None:
-        self._frontend = frontend
+        self._detect = WorldKeypoints(frontend)
         self._camera = camera
         self._settings = settings or OdometrySettings()
         self._use_stability = use_stability
@@ -110,7 +110,11 @@ class VisualOdometry:
         with self._thread.alone():
             self._refuse_if_finished()
             check_frame(frame, self._camera)
-            return self.track_features(features_of(self._frontend, frame), frame.time, frame.image)
+            return self.track_features(self.detect(frame), frame.time, frame.image)
+
+    def detect(self, frame: Frame) -> Features:
+        """Features of the next frame; frames in order, each once, and it may run up to two frames ahead in a thread."""
+        return self._detect(frame)
 
     def track_features(self, features: Features, time: float, image: UInt8 | None = None) -> TrackedFrame:
         """As `track`, with the features of the frame and its time in seconds at hand.
@@ -154,6 +158,7 @@ class VisualOdometry:
             self._mapper = mapper(self._camera, self._settings, distance, self._result, self._events)
         self._mapper.track(view)
         self._newest = view
+        self._detect.know(view.frame_index, self._mapper.dispensable_pixels(view))
         return TrackedFrame(
             view.frame_index,
             view.time,

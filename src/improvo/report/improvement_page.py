@@ -84,10 +84,14 @@ def write_improvement_page(
         "The best of each row is bold.",
     )
     page.details("What the rows mean", _meanings(measures))
+    # where nothing was kept, the last try is held against the start
+    tried = [entry for entry in rounds[1:] if not entry.aside]
+    after, kept = (last, "") if last is not first else (tried[-1] if tried else None, ", not kept")
     for place in range(max(len(entry.pictures) for entry in rounds)):
         shown = [
-            (picture, f"{entry.name}: {caption}")
-            for entry in ((first, last) if last is not first else (first,))
+            (picture, f"{entry.name}{kept if entry is after else ''}: {caption}")
+            for entry in (first, after)
+            if entry is not None
             for picture, caption in entry.pictures[place : place + 1]
         ]
         page.side_by_side(shown)

@@ -15,6 +15,7 @@ from improvo.report.map_picture import map_png
 from improvo.report.page import Page, plain
 from improvo.report.palettes import PALETTES, Palette
 from improvo.report.plain_words import LABEL_WORDS, warnings
+from improvo.terminal import counted
 
 _MAX_MAPS = 12
 _MAX_NAMES = 3  # of recordings, in the title
@@ -35,13 +36,13 @@ def write_label_page(folder: Path, path: Path, palette: Palette = PALETTES["pape
     totals = {name: sum(int(row[name]) for row in rows) for name in ("stable", "unstable", "ignore", "withheld")}
     page = Page(
         f"Labels of {_named([str(row['name']) for row in rows])}",
-        f"{len(rows)} sequences, labelled by `improvo label`.",
+        f"{counted(len(rows), 'sequence')}, labelled by `improvo label`.",
     )
     page.tiles(
         [
             (f"{len(runs)} of {len(rows)}", "sequences with labels"),
             (f"{sum(int(row['tracked']) for row in rows):,}", "frames with a pose"),
-            *((f"{count:,}", f"{name} tracks") for name, count in totals.items()),
+            *((f"{count:,}", f"tracks: {name}") for name, count in totals.items()),
         ]
     )
     failed = [f"{row['name']} has no labels: {row['reason']}." for row in rows if row["state"] != DONE]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from improvo.frontend.architecture import CELL
 from improvo.training.alignment import aligned
 from improvo.training.distributed import Process
 from improvo.training.held_settings import HeldSettings
-from improvo.training.labels import DUSTBIN
 from improvo.training.photometric_batch import augment_batch
 from improvo.training.picture_store import MaskStore, PictureStore, on_device
 from improvo.training.pictures import Pictures, Source
@@ -22,7 +21,9 @@ from improvo.training.posed import PosedSequence, overlapping_pairs
 from improvo.training.posed_frames import PosedFrames
 from improvo.training.random_views import random_views
 from improvo.training.teacher import Teacher
+from improvo.training.view_points import cell_corners, cell_keypoints, warped, within
 from improvo.training.views import inside, warp_points
+from improvo.training.whole_frames import WholeFrames
 from improvo.types import Float64, Int64
 
 _SPREAD = 1.0  # of the random part of a keypoint's score, beside the logarithm of its probability
@@ -37,6 +38,8 @@ class _Plan:
     b_from_a: Float64  # (B, 3, 3) between the pictures; of no use for the first `posed` pairs
     view_from_picture: Float64  # (2B, 3, 3), first the a views
     posed: int  # so many pairs, the first ones, are related by depth and poses
+    size: tuple[int, int]  # width, height of the views
+    whole: bool = False  # the views are the frames as they are
 
 
 class DevicePairs:
@@ -76,6 +79,8 @@ class DevicePairs:
         self.pairs = [overlapping_pairs(sequence, settings.pairs) for sequence in posed]
         self.weights = np.array([sequence.weight for sequence in posed])
         self.useful = [row for row, pairs in enumerate(self.pairs) if pairs is not None]
+        self.whole = settings.pairs.whole_frames if settings.pairs.two_frames and self.useful else 0
+        self.whole_frames = WholeFrames(self.store, self._taught_of_each, settings.pairs.frames_remembered)
         self.process = Process.current()
 
     def __len__(self) -> int:
@@ -86,29 +91,59 @@ class DevicePairs:
             return self._batch(step)
 
     def _batch(self, step: int) -> dict[str, Tensor]:
-        settings, views = self.settings, self.settings.views
+        settings = self.settings
         rng = np.random.default_rng([settings.optimiser.seed, step, self.process.rank])
         generator = torch.Generator(self.device).manual_seed(int(rng.integers(2**62)))
-        plan = self._plan(rng, len(self.process.part_of(settings.optimiser.batch_size)))
-        shown = self.store.views(plan.rows.T.ravel(), plan.view_from_picture, views.width, views.height)
-        images = augment_batch(shown, rng, generator, settings.photometric)
-        batch = {"images": images, "scenes": on_device(plan.scenes, self.device), **self.taught(images)}
+        if self.whole:
+            plan = self._two_whole(rng, len(self.process.part_of(self.whole)))
+        else:
+            plan = self._plan(rng, len(self.process.part_of(settings.optimiser.batch_size)))
+        if plan.whole:
+            batch = self.whole_frames.batch(plan.rows.T.ravel())
+            if "stability" in batch:
+                batch["stability"] = batch["stability"][:: settings.stability_every]
+        else:
+            shown = self.store.views(plan.rows.T.ravel(), plan.view_from_picture, *plan.size)
+            images = augment_batch(shown, rng, generator, settings.photometric)
+            batch = {"images": images, **self.taught(images)}
+        batch["scenes"] = on_device(plan.scenes, self.device)
         logits = batch["detector"]
-        return {**batch, **self._points(plan, logits[: len(plan.rows)].float(), generator)}
+        points = self._points(plan, logits[: len(plan.rows)].float(), generator)
+        if settings.pairs.alone:
+            points = self._with_alone(plan, logits.float(), points)
+        return {**batch, **points}
 
-    def taught(self, images: Tensor) -> dict[str, Tensor]:
-        """What the teachers say of views (V, 1, H, W) uint8: `detector` and, with a teacher of it, `stability`."""
+    def _taught_of_each(self, images: Tensor) -> dict[str, Tensor]:
+        return self.taught(images, every=1)
+
+    def taught(self, images: Tensor, every: int = 0) -> dict[str, Tensor]:
+        """What the teachers say of views (V, 1, H, W) uint8: `detector` and, with a teacher of it, `stability`.
+
+        Args:
+            every: so many views for one that the teacher of stability looks at; 0 for what the settings say.
+        """
         network_input = (images.float() / 255).contiguous(memory_format=torch.channels_last)
         frozen = self.settings.frozen_layers
         logits, stem = self.detector(network_input, frozen)
         said = {"detector": logits, **({"stem": stem} if frozen else {})}
         if self.stability is not None and not self.settings.holds_by_itself:
-            said["stability"] = self.stability(network_input[:: self.settings.stability_every])[0]
+            said["stability"] = self.stability(network_input[:: every or self.settings.stability_every])[0]
         return said
+
+    def _two_whole(self, rng: np.random.Generator, count: int) -> _Plan:
+        """Two frames each of one recording, as they are but for what is beyond the last whole cell."""
+        scene = self._scenes(rng, 1)[0]
+        pairs = self.pairs[scene]
+        assert pairs is not None
+        rows = self.frames.first[scene] + np.array([pairs.draw(rng)[:2] for _ in range(count)], np.int64)
+        none = np.tile(np.eye(3), (2 * count, 1, 1))
+        return _Plan(
+            rows, np.full(count, scene), none[:count], none, count, self.whole_frames.size(rows[0, 0]), whole=True
+        )
 
     def _plan(self, rng: np.random.Generator, count: int) -> _Plan:
         """Which pictures are seen, and from where."""
-        settings = self.settings.pairs
+        settings, views = self.settings.pairs, self.settings.views
         share = settings.posed_share if self.sources else 1.0
         posed = round(share * count) if self.useful else 0
         rows, scenes = np.zeros((count, 2), np.int64), np.zeros(count, np.int64)
@@ -128,10 +163,10 @@ class DevicePairs:
                 rows[pair] = self.first_picture[source] + np.array([a, b])
         related = posed if settings.two_frames else 0
         sizes = self.store.sizes[rows].astype(np.float64)
-        H_a = random_views(rng, self.settings.views, sizes[:, 0], centres[0])
+        H_a = random_views(rng, views, sizes[:, 0], centres[0])
         self._look_there(H_a, b_from_a, rows, sizes, centres[1], related)
-        H_b = random_views(rng, self.settings.views, sizes[:, 1], centres[1])
-        return _Plan(rows, scenes, b_from_a, np.concatenate([H_a, H_b]), related)
+        H_b = random_views(rng, views, sizes[:, 1], centres[1])
+        return _Plan(rows, scenes, b_from_a, np.concatenate([H_a, H_b]), related, (views.width, views.height))
 
     def _scenes(self, rng: np.random.Generator, count: int) -> list[int]:
         """Which sequences the pairs are of: every one once before any comes again, or, of different weights, drawn."""
@@ -167,11 +202,8 @@ class DevicePairs:
         """Keypoints of view a and other points, one candidate of either kind a cell, as far as view b shows them."""
         settings = self.settings.pairs
         pairs, _, rows, columns = logits.shape
-        scores, best = logits[:, :DUSTBIN].flatten(2).max(dim=1)
-        scores = scores - torch.logsumexp(logits.flatten(2), dim=1)
-        cells = torch.arange(rows * columns, device=logits.device)
-        corner = torch.stack([cells % columns, cells // columns], dim=-1) * float(CELL)  # (C, 2)
-        keypoints = corner + torch.stack([best % CELL, best // CELL], dim=-1)
+        keypoints, scores = cell_keypoints(logits)
+        corner = cell_corners(rows, columns, logits.device)
         shape = (pairs, rows * columns, 2)
         others = corner + CELL * torch.rand(shape, generator=generator, device=logits.device) - 0.5
         noise = -torch.log(
@@ -179,8 +211,9 @@ class DevicePairs:
         )
         candidates = torch.cat([keypoints, others], dim=1)
         carried, visible = self._carry(plan, candidates)
-        wanted = round(settings.points * settings.keypoint_share)
-        kept = min(wanted, rows * columns), min(settings.points - wanted, rows * columns)
+        points = settings.whole_points if plan.whole else settings.points
+        wanted = round(points * settings.keypoint_share)
+        kept = min(wanted, rows * columns), min(points - wanted, rows * columns)
         rank = torch.cat([scores + _SPREAD * noise[..., 0], noise[..., 1]], dim=1).masked_fill(~visible, -torch.inf)
         halves = rank.split(rows * columns, dim=1)
         chosen = torch.cat(
@@ -194,11 +227,40 @@ class DevicePairs:
             points_b, valid = self._by_pictures(plan, points_a, points_b, valid)
         return {"points_a": points_a, "points_b": points_b, "valid": valid}
 
-    def _carry(self, plan: _Plan, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels of view b (B, N, 2) of pixels of view a, and whether both pictures show the place."""
-        views, count = self.settings.views, len(plan.rows)
-        in_a = _warped(np.asarray(np.linalg.inv(plan.view_from_picture[:count])), points)
-        in_b = _warped(plan.b_from_a, in_a)
+    def _with_alone(self, plan: _Plan, logits: Tensor, points: dict[str, Tensor]) -> dict[str, Tensor]:
+        """More rows, which are no correspondences: the best keypoints of either view that the other one does not show.
+
+        They are wrong partners of the others, as in use, where most keypoints of distant frames have no partner.
+        """
+        count = len(plan.rows)
+        a_from_b = np.asarray(np.linalg.inv(plan.b_from_a))
+        views = np.roll(plan.view_from_picture, count, axis=0)
+        turned = replace(plan, rows=plan.rows[:, ::-1], b_from_a=a_from_b, view_from_picture=views)
+        most = min(self.settings.pairs.alone, logits.shape[2] * logits.shape[3])
+        found, known = [], []
+        for one, seen in ((plan, logits[:count]), (turned, logits[count:])):
+            keypoints, scores = cell_keypoints(seen)
+            absent = self._carry(one, keypoints, absent=True)[1]
+            rank, best = scores.masked_fill(~absent, -torch.inf).topk(most, dim=1)
+            found.append(keypoints.gather(1, best[..., None].expand(-1, -1, 2)))
+            known.append(rank.isfinite())
+        invalid = torch.zeros_like(known[0])
+        return {
+            "points_a": torch.cat([points["points_a"], found[0]], dim=1),
+            "points_b": torch.cat([points["points_b"], found[1]], dim=1),
+            "valid": torch.cat([points["valid"], invalid], dim=1),
+            "negative": torch.cat([points["valid"], known[0]], dim=1),
+            "negative_b": torch.cat([points["valid"], known[1]], dim=1),
+        }
+
+    def _carry(self, plan: _Plan, points: Tensor, absent: bool = False) -> tuple[Tensor, Tensor]:
+        """Pixels of view b (B, N, 2) of pixels of view a, and whether both pictures show the place.
+
+        With `absent` instead whether it is certain that view b does not show it.
+        """
+        count = len(plan.rows)
+        in_a = warped(np.asarray(np.linalg.inv(plan.view_from_picture[:count])), points)
+        in_b = warped(plan.b_from_a, in_a)
         visible = torch.ones_like(in_a[..., 0], dtype=torch.bool)
         if plan.posed:
             rows = plan.rows[: plan.posed]
@@ -207,25 +269,31 @@ class DevicePairs:
             in_b[: plan.posed] = carried.places
             visible[: plan.posed] = self.frames.shown(rows, carried, self.settings.pairs.depth_tolerance)
         sizes = on_device(self.store.sizes[plan.rows].astype(np.float32), points.device)
-        visible = visible & _within(in_a, sizes[:, 0]) & _within(in_b, sizes[:, 1])
+        if absent:
+            known = torch.ones_like(visible)
+            if plan.posed:
+                known[: plan.posed] = inverse > 0
+            there = warped(plan.view_from_picture[count:], in_b)
+            size = on_device(np.array([plan.size], np.float32), there.device)
+            margin = self.settings.masked_pixels
+            return there, known & within(in_a, sizes[:, 0]) & ~within(there + margin, size + 2 * margin)
+        visible = visible & within(in_a, sizes[:, 0]) & within(in_b, sizes[:, 1])
         if self.masks is not None:
             visible = visible & self.masks.used(plan.rows[:, 0], in_a) & self.masks.used(plan.rows[:, 1], in_b)
-        result = _warped(plan.view_from_picture[count:], torch.where(visible[..., None], in_b, 0.0))
-        return result, visible & _within(
-            result, on_device(np.array([[views.width, views.height]], np.float32), points.device)
-        )
+        result = warped(plan.view_from_picture[count:], torch.where(visible[..., None], in_b, 0.0))
+        return result, visible & within(result, on_device(np.array([plan.size], np.float32), points.device))
 
     def _by_pictures(self, plan: _Plan, points_a: Tensor, points_b: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Partners (B, N, 2) of pixels of the a views, and which are known: by depth, and as the pictures have them."""
-        views, posed = self.settings.views, plan.posed
+        posed = plan.posed
         rows = plan.rows[:posed]
-        in_a = _warped(np.asarray(np.linalg.inv(plan.view_from_picture[:posed])), points_a[:posed])
+        in_a = warped(np.asarray(np.linalg.inv(plan.view_from_picture[:posed])), points_a[:posed])
         inverse = torch.where(valid[:posed], self.frames.depths.sample(rows[:, 0], in_a), 0.0)
         found = aligned(self.store, self.frames, rows, in_a, inverse, self.settings.pairs.align)
         kept = valid[:posed] & ~found.contradicted
-        moved = _warped(plan.view_from_picture[len(valid) : len(valid) + posed], found.places)
-        size = on_device(np.array([[views.width, views.height]], np.float32), moved.device)
-        kept = kept & _within(moved, size)
+        moved = warped(plan.view_from_picture[len(valid) : len(valid) + posed], found.places)
+        size = on_device(np.array([plan.size], np.float32), moved.device)
+        kept = kept & within(moved, size)
         points_b = torch.cat([torch.where(kept[..., None], moved, 0.0), points_b[posed:]])
         return points_b, torch.cat([kept, valid[posed:]])
 
@@ -236,17 +304,3 @@ def _mask_store(runs: Sequence[PosedSequence | Source], store: PictureStore, dev
         return None
     masks = [mask for run in runs for mask in (run.masks or (None,) * len(run.pictures))]
     return MaskStore(masks, store.sizes[: store.count], device)
-
-
-def _warped(H: Float64, points: Tensor) -> Tensor:
-    """Pixels (B, N, 2) through homographies (B, 3, 3); far outside at and beyond the horizon."""
-    matrix = on_device(H, points.device)
-    seen = torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
-    seen = (seen[:, :, None] * matrix[:, None]).sum(dim=-1)  # in full precision whatever a product may use
-    depth = seen[..., 2:]
-    return torch.where(depth > 1e-6, seen[..., :2] / depth.clamp(min=1e-6), -1e6)
-
-
-def _within(points: Tensor, sizes: Tensor) -> Tensor:
-    """(B, N) whether points (B, N, 2) lie within images of sizes (B, 2) width, height."""
-    return ((points >= 0) & (points <= sizes[:, None] - 1)).all(dim=-1)

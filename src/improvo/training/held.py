@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -28,8 +28,17 @@ class HeldStage(Stage):
             for head in (network.detector, network.stability):
                 if head is not None:
                     head.requires_grad_(False)
-        self.log_scale = nn.Parameter(torch.tensor(math.log(20.0)))  # inverse temperature of the InfoNCE loss
+        self.log_scale = nn.Parameter(torch.tensor(math.log(settings.scale)))  # inverse temperature of the InfoNCE loss
         self._compiled: Any = None
+
+    def train(self, mode: bool = True) -> Self:
+        """As in torch; batch norms keep their statistics where the settings say so."""
+        super().train(mode)
+        if self.settings.fixed_statistics:
+            for part in self.modules():
+                if isinstance(part, nn.BatchNorm2d):
+                    part.eval()
+        return self
 
     def losses(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """See `Stage`; `batch` is that of `DevicePairs`."""
@@ -46,6 +55,7 @@ class HeldStage(Stage):
             descriptor = info_nce_loss(
                 a, b, points_a, points_b, batch["valid"], scale, settings.masked_pixels,
                 negative=batch.get("negative"), group=math.gcd(settings.pairs.group, len(a)), scenes=batch["scenes"],
+                negative_b=batch.get("negative_b"),
             )  # fmt: skip
             total, result = settings.descriptor_weight * descriptor, {"descriptor": descriptor}
             if detector_logits is not None:

@@ -46,13 +46,19 @@ class DevicePairSettings:
     points: int = 384  # correspondences taught per pair, at most
     keypoint_share: float = 0.5  # of them are keypoints of the detector that is held, the rest lie anywhere
     group: int = 4  # so many pairs are each other's wrong partners
+    alone: int = 0  # keypoints of either view that the other one does not show, at most, which are wrong partners
+    # where above 0, two frames are shown as they are, so many pairs of one recording a step, and not through views
+    whole_frames: int = 0
+    whole_points: int = 500  # correspondences taught per pair of whole frames, at most
+    frames_remembered: int = 256  # whole frames, at most, of which what is held to is looked up and not said again
     aligned: bool = False  # move correspondences by depth to where the pictures agree, and drop those that do not
     align: AlignmentSettings = field(default_factory=AlignmentSettings)
 
     def __post_init__(self) -> None:
         checks = Checks(self, "pairs")
         checks.between(0, 1, "posed_share", "keypoint_share", "least_overlap")
-        checks.at_least(2, "points")
+        checks.at_least(2, "points", "whole_points")
+        checks.at_least(0, "whole_frames", "alone", "frames_remembered")
         checks.at_least(1, "group")
         checks.positive("largest_gap", "depth_tolerance")
 
@@ -70,6 +76,9 @@ class HeldSettings:
     # the first ones of the encoder's eight layers that stay as they are; with 8 the other heads stay too, and need not
     # be held
     frozen_layers: int = 0
+    # batch norm by the statistics of the weights that it starts from, as in use, and not by those of a few views
+    fixed_statistics: bool = False
+    scale: float = 20.0  # inverse temperature of the descriptor loss at the start
     compile: bool = False  # let torch fuse the network's operations; needs a C compiler
     pairs: DevicePairSettings = field(default_factory=DevicePairSettings)
     optimiser: OptimiserSettings = field(
@@ -90,6 +99,7 @@ class HeldSettings:
     def __post_init__(self) -> None:
         checks = Checks(self)
         checks.at_least(0, "descriptor_weight", "detector_weight", "stability_weight", "masked_pixels")
+        checks.positive("scale")
         checks.at_least(2 * CELL, "longer_side")
         checks.at_least(1, "stability_every")
         checks.that("frozen_layers", 0 <= self.frozen_layers <= _ENCODER_LAYERS, f"must be 0 to {_ENCODER_LAYERS}")

@@ -44,7 +44,8 @@ def train_held(
         stability_from: weights whose stability head is held to; without it the result has no such head.
         data: what the model card says about the pictures; the sources' names where it is empty.
         seconds: of preparing and training; where given, the number of steps follows from it.
-        labels: label stores, whose tracks teach in every second step; left out where no frame has enough of them.
+        labels: label stores, whose tracks teach in every second step; left out where no frame has enough of them, and
+            where whole frames teach.
     """
     begun = time.monotonic()
     parent = load_weights(start)
@@ -58,7 +59,7 @@ def train_held(
         pictures, posed, settings, network_teacher(parent, "detector", device, precision),
         network_teacher(stability, "stability", device, precision) if stability else None, device,
     )  # fmt: skip
-    batches = _with_tracks(dense, labels, output)
+    batches = dense if dense.whole else _with_tracks(dense, labels, output)
     if not data:
         names = (*(source.name for source in pictures.sources), *(sequence.name for sequence in posed))
         data = tuple(DataSource(name, "not stated") for name in names)

@@ -55,6 +55,7 @@ def info_nce_loss(
     negative: Tensor | None = None,
     group: int = 1,
     scenes: Tensor | None = None,
+    negative_b: Tensor | None = None,
 ) -> Tensor:
     """Symmetric InfoNCE over sparse correspondences: each descriptor must pick its partner among those of its pair.
 
@@ -69,15 +70,19 @@ def info_nce_loss(
         negative: (B, N) bool, which rows may be wrong partners of others; the valid ones where it is not given.
         group: so many consecutive pairs have their points for each other's negatives too; B must be a multiple.
         scenes: (B,) int; pairs of the same scene, which may show the same places, are not each other's negatives.
+        negative_b: (B, N) bool, as `negative` for the b parts of the rows, where these differ.
     """
     negative = valid if negative is None else negative
+    negative_b = negative if negative_b is None else negative_b
     # not by matrix products, which may run in low precision
     near = _near(points_a, masked_pixels) | _near(points_b, masked_pixels)
     if group > 1:  # large pairs, in which only points of the same view can be near each other
         near = _grouped(near, group, scenes)
         a, b = (part.reshape(-1, group * part.shape[1], part.shape[2]) for part in (a, b))
-        valid, negative = (part.reshape(-1, group * part.shape[1]) for part in (valid, negative))
-    refused = near | ~negative[:, None, :] | ~negative[:, :, None]
+        valid, negative, negative_b = (
+            part.reshape(-1, group * part.shape[1]) for part in (valid, negative, negative_b)
+        )
+    refused = near | ~negative_b[:, None, :] | ~negative[:, :, None]
     itself = torch.eye(a.shape[1], dtype=torch.bool, device=a.device)
     similarity = (scale * torch.einsum("bnd,bmd->bnm", a, b)).masked_fill(refused & ~itself, -1e4)
     forward = torch.logsumexp(similarity, dim=2)

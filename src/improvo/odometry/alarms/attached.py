@@ -10,23 +10,22 @@ with the world count for it; both are slowly forgotten. Keypoints of a cell with
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from improvo.geometry.a_contrario import line_probability, log10_false_alarms
+from improvo.geometry.a_contrario import SIGNIFICANT, line_probability, log10_false_alarms
 from improvo.geometry.camera import Camera
 from improvo.geometry.epipolar import half_line_distances
 from improvo.geometry.ransac import Ransac, relative_pose
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.view import Mask, View, common_tracks
+from improvo.odometry.view import NO_POINT, Mask, View, common_tracks
 from improvo.tracking.matching import match_units
 from improvo.types import Float64, Int64
 
 _COLUMNS, _ROWS = 16, 12  # cells of the picture
-_FEATURES = 600  # of each view, the strongest
+_FEATURES = 600  # of each view, the strongest within the cells that are attached, or may be, and as many outside
 _MIN_MOVING = 20  # matches that moved; fewer say nothing about the camera
-_SIGNIFICANT = -6.0  # log10 of the number of false alarms of their essential matrix
 _MIN_SHARE = 0.5  # of them that agree with it
 _MOVED = 3.0  # times the noise: a match that moved so far did move
 _OFF = 1.5  # times the noise: a match so far from where a point of the world can be is not of it
@@ -35,6 +34,8 @@ _ENOUGH = 3.0  # matches against a cell,
 _MOST = 2  # of which one comparison gives so many
 _SHORTEST = 5  # frames between two views that are compared, where enough tracks last; a slow world moves by then
 _LONGEST = 30  # frames between two views that are compared
+_MANY = 0.3  # share of the keypoints within such cells; then the frontend is asked for more of the world
+_PATIENCE = 5  # comparisons in a row that suspect something and find out nothing: a person before a still camera
 
 
 class AttachedDetector:
@@ -53,13 +54,29 @@ class AttachedDetector:
         self._descriptor_distance = descriptor_distance
         self._noise = settings.attached.noise * max(1.0, camera.width / 640.0)
         self._anchor: View | None = None
+        self._most_moved = 0  # tracks that had moved since the anchor, at most
         self._against, self._for = np.zeros(_ROWS * _COLUMNS), np.zeros(_ROWS * _COLUMNS)
+        self._suspected = np.zeros(_ROWS * _COLUMNS, bool)  # cells that stand, while too little moves to conclude
+        self._in_vain = 0  # comparisons in a row that suspected something
 
     @property
     def cells(self) -> Mask:
         """(C,) cells of the picture, row by row, that show something attached to the camera."""
         against, world = _with_neighbours(self._against), _with_neighbours(self._for)
         return (against >= _ENOUGH) & (against > world)
+
+    def dispensable(self, view: View) -> Mask | None:
+        """(H, W) what is attached, or may be; None where few of a view's keypoints lie there.
+
+        A frontend that keeps its strongest keypoints can have so few of the world that nothing can be concluded, or
+        no map can start. There it is asked again, for the rest of the picture (`world_keypoints.py`).
+        """
+        cells = self.cells | self._suspected
+        if not cells.any() or cells[self._cell(view.keypoints)].mean() <= _MANY:
+            return None
+        rows = np.arange(self._camera.height) * _ROWS // self._camera.height
+        columns = np.arange(self._camera.width) * _COLUMNS // self._camera.width
+        return np.asarray(cells.reshape(_ROWS, _COLUMNS)[np.ix_(rows, columns)])
 
     def observe(self, view: View) -> bool:
         """Mark the keypoints of the newest view.
@@ -83,6 +100,15 @@ class AttachedDetector:
                 moved = np.linalg.norm(view.keypoints[rows] - self._anchor.keypoints[rows_anchor], axis=1)
                 view.attached[rows[moved > _MOVED * self._noise]] = False
 
+    def drop(self, views: Sequence[View]) -> float:
+        """Mark views anew, and drop what their marked keypoints observe; returns its share of all observations."""
+        self.mark(views)
+        observed = [each.points >= 0 for each in views]
+        dropped = sum(int((each.attached & seen).sum()) for each, seen in zip(views, observed, strict=True))
+        for each in views:
+            each.points[each.attached] = NO_POINT
+        return dropped / max(sum(int(seen.sum()) for seen in observed), 1)
+
     def _cell(self, pixels: Float64) -> Int64:
         column = np.clip(pixels[:, 0] * _COLUMNS / self._camera.width, 0, _COLUMNS - 1).astype(np.int64)
         row = np.clip(pixels[:, 1] * _ROWS / self._camera.height, 0, _ROWS - 1).astype(np.int64)
@@ -94,39 +120,67 @@ class AttachedDetector:
         if anchor is not None and view.frame_index - anchor.frame_index <= _LONGEST:
             # a track that is not younger than the anchor was seen in it, since tracks have no gaps
             few_left = (view.tracks <= anchor.tracks.max(initial=-1)).sum() < 2 * _MIN_MOVING
-            if not few_left and view.frame_index - anchor.frame_index < _SHORTEST:
-                return
             rows, rows_anchor = common_tracks(view, anchor)
             motion = np.linalg.norm(view.keypoints[rows] - anchor.keypoints[rows_anchor], axis=1)
             moved = motion[motion > _MOVED * self._noise]
-            if not few_left and (len(moved) < _MIN_MOVING or np.median(moved) < self._settings.min_flow * self._noise):
+            self._most_moved = max(self._most_moved, len(moved))
+            slow = len(moved) < _MIN_MOVING or np.median(moved) < self._settings.min_flow * self._noise
+            ending = (
+                self._most_moved >= _MIN_MOVING and len(moved) < 0.5 * self._most_moved
+            )  # while a logo's tracks stay
+            if not few_left and ((slow and not ending) or view.frame_index - anchor.frame_index < _SHORTEST):
                 return
             self._weigh(anchor, view)
-        self._anchor = view
+        self._anchor, self._most_moved = view, 0
 
     def _weigh(self, anchor: View, view: View) -> None:
         """Evidence from two views."""
-        matches = match_units(anchor.descriptors[:_FEATURES], view.descriptors[:_FEATURES], self._descriptor_distance)
-        before, now = anchor.keypoints[matches[:, 0]], view.keypoints[matches[:, 1]]
+        rows_before, rows_now = self._strongest(anchor), self._strongest(view)
+        matches = match_units(anchor.descriptors[rows_before], view.descriptors[rows_now], self._descriptor_distance)
+        before, now = anchor.keypoints[rows_before[matches[:, 0]]], view.keypoints[rows_now[matches[:, 1]]]
         cells = self._cell(now)
         motion = np.linalg.norm(now - before, axis=1)
         still, moved = motion <= self._noise, np.flatnonzero(motion > _MOVED * self._noise)
-        occupied = len(np.unique(cells[still])), len(np.unique(cells[moved]))
-        if len(moved) < _MIN_MOVING or occupied[1] < self._settings.min_moving_cells * sum(occupied):
+        if len(moved) < _MIN_MOVING or not self._enough_moves(cells[still], cells[moved]):
+            self._suspect(cells[still], cells[moved])
             return
         ransac = Ransac(self._noise, self._seed, min_iterations=100, max_iterations=1000)
         world = relative_pose(before[moved], now[moved], self._camera, ransac)
         chance = line_probability(self._camera.width, self._camera.height, self._noise)
         inliers = int(world.inliers.sum())
         if inliers < _MIN_SHARE * len(moved) or (
-            log10_false_alarms(len(moved), inliers, chance, sample=5, models=10) > _SIGNIFICANT
+            log10_false_alarms(len(moved), inliers, chance, sample=5, models=10) > SIGNIFICANT
         ):
+            self._suspect(cells[still], cells[moved])
             return
+        self._suspected[:], self._in_vain = False, 0
         errors = half_line_distances(world.pose, self._camera, before[still], now[still])
         self._against *= _KEPT
         self._for *= _KEPT
         self._against += self._counted(cells[still][errors > _OFF * self._noise])
         self._for += self._counted(cells[moved[world.inliers]])
+
+    def _strongest(self, view: View) -> Int64:
+        """Rows of a view's keypoints; of the world as many as if nothing were attached."""
+        apart = (self.cells | self._suspected)[self._cell(view.keypoints)]
+        parts = [np.flatnonzero(part)[:_FEATURES] for part in (apart, ~apart)]
+        return np.sort(np.concatenate(parts)) if apart.any() else parts[1]
+
+    def _enough_moves(self, still: Int64, moved: Int64) -> bool:
+        """Whether enough of the picture moves, by the cells of the matches that stand and of those that moved.
+
+        While the frontend is asked for more of the world, all of the picture counts, since cells of the world are then
+        filled more than others.
+        """
+        occupied = len(np.unique(still)), len(np.unique(moved))
+        whole = self._suspected.size if self._suspected.any() else sum(occupied)
+        return occupied[1] >= self._settings.min_moving_cells * whole
+
+    def _suspect(self, still: Int64, moved: Int64) -> None:
+        """Nothing can be concluded: the frontend may have spent its keypoints on what stands."""
+        counts = [np.bincount(each, minlength=self._suspected.size) for each in (still, moved)]
+        self._in_vain += 1
+        self._suspected = (counts[0] > counts[1]) & (self._in_vain <= _PATIENCE)
 
     def _counted(self, cells: Int64) -> Float64:
         """Matches in each cell (C,); a single comparison may not decide about one."""

@@ -21,7 +21,40 @@ _LEAST = np.log(1.08)  # change of the distances in one frame; a step ahead rare
 _MIN_POINTS = 20  # of the map, in both views
 _BETTER = 1.25  # times as many points must fit with the other focal length,
 _MORE = 8  # and so many more
+_SAME_LENS = 0.05  # relative difference from the camera as given that is none
 _TOLERANCE = 0.5  # times the map's own largest error, since a zoom is told by what lies close
+
+
+class LensWatch:
+    """What the lens is now: a change holds for all that follows, until the next one.
+
+    Args:
+        camera: as it is given.
+        max_error: pixels, largest error of an observation of the map.
+        seed: of the RANSAC.
+    """
+
+    def __init__(self, camera: Camera, max_error: float, seed: int) -> None:
+        self._camera, self._max_error, self._seed = camera, max_error, seed
+        self.factor = 1.0  # of the focal length now, times that of the camera as given
+
+    def changed(self, before: View, view: View, xyz: Float64) -> bool:
+        """Whether the lens changed just before a view.
+
+        Args:
+            before: the last view with a pose and points of the map.
+            view: the newest, without a pose yet.
+            xyz: (P, 3) points of the map.
+        """
+        if before.frame_index != view.frame_index - 1:
+            return False
+        change = focal_change(before, view, xyz, self._camera, self._max_error, self._seed)
+        if change == 1.0:
+            return False
+        self.factor *= change
+        if abs(self.factor - 1.0) < _SAME_LENS:
+            self.factor = 1.0
+        return True
 
 
 def focal_change(before: View, view: View, xyz: Float64, camera: Camera, max_error: float, seed: int) -> float:

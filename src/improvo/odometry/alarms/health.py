@@ -19,7 +19,7 @@ from improvo.geometry.epipolar import sampson_errors
 from improvo.geometry.ransac import Ransac, relative_pose
 from improvo.odometry.alarms.two_motions import holds_beside
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.view import View, matches_of_world, ransac_pairs
+from improvo.odometry.view import View, ransac_pairs
 from improvo.tracking.matching import match_units
 from improvo.types import Int64
 
@@ -33,6 +33,7 @@ class Agreement:
     map_inliers: int
     own_inliers: int
     matches: int
+    turn_deg: float = 0.0  # between the rotations of both poses
     two_motions: bool = False  # each is supported by matches that are far off the other; the check decides nothing
 
 
@@ -44,7 +45,7 @@ class HealthCheck:
 
     Args:
         camera: pinhole camera of the views.
-        settings: of the odometry; `health`, `ransac_gate` and `seed` are used.
+        settings: of the odometry; `health`, `ransac_gate`, `start` and `seed` are used.
         descriptor_distance: the matching threshold on unit descriptors.
     """
 
@@ -74,8 +75,10 @@ class HealthCheck:
                 earlier[view.frame_index - gap], view, self._camera, self._descriptor_distance, self._settings
             )
             two_motions |= found.two_motions
-            enough = found.own_inliers >= max(settings.min_inliers, settings.min_inlier_share * found.matches)
-            if enough and not found.two_motions:
+            enough = found.own_inliers >= max(
+                self._settings.start.min_points, settings.min_inlier_share * found.matches
+            )
+            if enough and found.turn_deg < settings.max_turn_deg and not found.two_motions:
                 counts[row] = found.map_inliers, found.own_inliers
         self._rounds.append(counts)
         self._two_motions = self._two_motions + 1 if two_motions else 0
@@ -106,8 +109,9 @@ def agreement(a: View, b: View, camera: Camera, descriptor_distance: float, sett
     """
     assert a.cam_from_world is not None
     assert b.cam_from_world is not None
-    matches = match_units(a.descriptors[:_FEATURES], b.descriptors[:_FEATURES], descriptor_distance)
-    matches = matches_of_world(a, b, matches)
+    rows_a, rows_b = (np.flatnonzero(~view.attached)[:_FEATURES] for view in (a, b))
+    matches = match_units(a.descriptors[rows_a], b.descriptors[rows_b], descriptor_distance)
+    matches = np.stack([rows_a[matches[:, 0]], rows_b[matches[:, 1]]], axis=1)
     if len(matches) < 8:
         return Agreement(0, 0, len(matches))
     pixels_a, pixels_b = a.keypoints[matches[:, 0]], b.keypoints[matches[:, 1]]
@@ -120,4 +124,5 @@ def agreement(a: View, b: View, camera: Camera, descriptor_distance: float, sett
     fits_own = own_errors < limit
     fits_own[used] = own.inliers  # which also lie in front of both
     two_motions = holds_beside(map_errors, own_errors, pixels_b, camera, limit)
-    return Agreement(int((map_errors < limit).sum()), int(fits_own.sum()), len(matches), two_motions)
+    turn = float(se3.rotation_angle_deg((of_map[:3, :3].T @ own.pose[:3, :3])[None])[0])
+    return Agreement(int((map_errors < limit).sum()), int(fits_own.sum()), len(matches), turn, two_motions)

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from improvo.geometry.a_contrario import line_probability, log10_false_alarms
+from improvo.geometry.a_contrario import SIGNIFICANT, line_probability, log10_false_alarms
 from improvo.geometry.camera import Camera
 from improvo.geometry.epipolar import sampson_errors
 from improvo.geometry.ransac import Ransac, relative_pose
 from improvo.types import Float64, Int64
 
 _FAR = 3.0  # times the tolerance: a match so far off the first motion is none of its own noise
-_SIGNIFICANT = -6.0  # log10 of the number of false alarms
 _LEAST_SPREAD = 0.3  # cells of the picture that the one has, as a share of those of the other
 _COLUMNS, _ROWS = 8, 6  # cells of the picture
 
@@ -40,7 +39,7 @@ def has_second_motion(
         return False
     second = relative_pose(pixels_a[off], pixels_b[off], camera, ransac)
     chance = line_probability(camera.width, camera.height, ransac.max_error)
-    if log10_false_alarms(len(off), int(second.inliers.sum()), chance, sample=5, models=10) > _SIGNIFICANT:
+    if log10_false_alarms(len(off), int(second.inliers.sum()), chance, sample=5, models=10) > SIGNIFICANT:
         return False
     own = errors <= ransac.max_error
     return spread(camera, pixels_b[off[second.inliers]]) >= least_spread * spread(camera, pixels_b[own])
@@ -61,7 +60,7 @@ def holds_beside(errors: Float64, errors_other: Float64, pixels: Float64, camera
     for own, other in ((errors, errors_other), (errors_other, errors)):
         off = other > _FAR * tolerance
         supporting = off & (own <= tolerance)
-        if log10_false_alarms(int(off.sum()), int(supporting.sum()), chance, sample=0) > _SIGNIFICANT:
+        if log10_false_alarms(int(off.sum()), int(supporting.sum()), chance, sample=0) > SIGNIFICANT:
             return False
         cells.append(spread(camera, pixels[supporting]))
     return min(cells) >= _LEAST_SPREAD * max(cells)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from improvo.geometry import se3
-from improvo.geometry.a_contrario import disc_probability, log10_false_alarms
+from improvo.geometry.a_contrario import SIGNIFICANT, disc_probability, log10_false_alarms
 from improvo.geometry.alignment import Similarity
 from improvo.geometry.camera import Camera
 from improvo.geometry.ransac import Ransac, absolute_pose
@@ -17,7 +17,6 @@ from improvo.tracking.matching import match_units
 from improvo.types import Float32, Float64, Int64
 
 _MOST_POINTS = 4000  # the newest; more cost time
-_FALSE_ALARMS = -6.0  # log10; a former map is searched hundreds of times, and joining a wrong one is worse than none
 _LEAST_SHARED = 10  # points of both maps that carry the scale
 
 
@@ -93,7 +92,7 @@ class FormerMap:
         found = absolute_pose(self._xyz[former], view.keypoints[rows], self._camera, self._ransac)
         inliers = int(found.inliers.sum())
         chance = disc_probability(self._camera.width, self._camera.height, self._ransac.max_error)
-        if log10_false_alarms(len(matches), inliers, chance, sample=3, models=4) > _FALSE_ALARMS:  # P3P
+        if log10_false_alarms(len(matches), inliers, chance, sample=3, models=4) > SIGNIFICANT:  # P3P
             return None
         both = found.inliers & (view.points[rows] >= 0)
         if both.sum() < _LEAST_SHARED:

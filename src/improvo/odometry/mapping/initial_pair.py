@@ -57,7 +57,7 @@ def initial_pair(
     start = settings.start
     matches = matches_of_world(a, b, match_units(a.descriptors, b.descriptors, descriptor_distance))
     rows_a, rows_b = matches[ransac_pairs(a, b, matches, settings.ransac_gate)].T
-    if len(rows_a) < start.min_matches:
+    if len(rows_a) < 2 * start.min_points:
         return InitFailure("too few matches")
     pixels_a, pixels_b = a.keypoints[rows_a], b.keypoints[rows_b]
     ransac = Ransac(start.epipolar_error, settings.seed, min_iterations=200, max_iterations=5000)
@@ -73,7 +73,7 @@ def initial_pair(
         return InitFailure("two motions: one of them is not the camera's")
     ratio = plane.inliers.sum() / max(inliers.sum(), 1)
     off_plane = (inliers & ~plane.inliers).sum()
-    if ratio > start.max_homography_ratio and off_plane < start.min_off_plane_points:
+    if ratio > start.max_homography_ratio and off_plane < 2 * start.min_points:
         if ratio < start.plane_ratio:
             return InitFailure("too little parallax")
         return _from_plane(a, b, rows_a, rows_b, plane, camera, start)

@@ -18,6 +18,8 @@ from improvo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_poin
 from improvo.tracking.matching import match_units
 from improvo.types import Float32, Float64, Int64
 
+_FASTER = 5.0  # times the fastest step before a loss: the camera cannot be farther off where it is found again,
+_FAST = 0.1  # unless it is within this share of the distance to what it sees, for each frame
 _SAME_SIDE = 0.5  # cosine of the angle between two rays to a point; features are not matched over 60 degrees
 
 
@@ -62,7 +64,11 @@ class LocalMap:
             for earlier in reversed(self.history):
                 self._match_with(view, earlier)
                 inliers, share = self._solve_pose(view)
-                if not self._is_lost(inliers, share) and self._from_same_side(view, earlier):
+                if (
+                    not self._is_lost(inliers, share)
+                    and self._from_same_side(view, earlier)
+                    and self._can_be_reached(view, neighbour)
+                ):
                     break
             else:
                 view.cam_from_world = None
@@ -76,7 +82,7 @@ class LocalMap:
     def _is_lost(self, inliers: int, share: float) -> bool:
         loss = self._settings.loss
         outliers = inliers / share - inliers if share > 0 else 0.0
-        return inliers < loss.min_inliers + loss.wrong_share * outliers or share < loss.min_inlier_share
+        return inliers < loss.min_inliers + loss.wrong_share * outliers
 
     def _from_same_side(self, view: View, other: View) -> bool:
         """Whether a view sees its points from where another one, with a pose, can have seen the same of them.
@@ -91,6 +97,25 @@ class LocalMap:
         rays = [xyz - se3.inverse(pose)[:3, 3] for pose in (view.cam_from_world, other.cam_from_world)]
         cosine = (rays[0] * rays[1]).sum(axis=1) / np.maximum(np.prod(np.linalg.norm(rays, axis=2), axis=0), 1e-12)
         return bool(np.median(cosine) > _SAME_SIDE)
+
+    def _can_be_reached(self, view: View, neighbour: View) -> bool:
+        """Whether the camera can have come from a neighbour's place to a view's within the frames between.
+
+        Things of which there are two look alike, and a place beside the one is found again beside the other.
+        """
+        assert view.cam_from_world is not None
+        assert neighbour.cam_from_world is not None
+        poses = [each.cam_from_world for each in self.history if each.cam_from_world is not None]
+        centers = np.array([se3.inverse(pose)[:3, 3] for pose in poses]).reshape(-1, 3)
+        frames = np.diff([each.frame_index for each in self.history if each.cam_from_world is not None])
+        fastest = float(
+            (np.linalg.norm(np.diff(centers, axis=0), axis=1) / np.maximum(np.abs(frames), 1)).max(initial=0.0)
+        )
+        center = se3.inverse(view.cam_from_world)[:3, 3]
+        seen = np.linalg.norm(self.store.xyz[view.points[view.observed]] - center, axis=1)
+        far = np.linalg.norm(center - se3.inverse(neighbour.cam_from_world)[:3, 3])
+        limit = max(_FASTER * fastest, _FAST * float(np.median(seen)))
+        return bool(far <= limit * abs(view.frame_index - neighbour.frame_index))
 
     def _match_with(self, view: View, earlier: View) -> None:
         """3D-to-2D matches of a view by descriptors alone, against the map points of one earlier view."""

@@ -67,7 +67,7 @@ class SlidingWindow:
             moved = np.linalg.norm(view.keypoints[rows[world]] - last.keypoints[rows_last[world]], axis=1)
             few_shared = len(shared_points) == 0 or shared_points.mean() < settings.keyframe_shared
             far = len(moved) == 0 or np.median(moved) > settings.keyframe_motion * self._image_width
-            long_ago = view.frame_index - last.frame_index >= settings.keyframe_interval
+            long_ago = view.frame_index - last.frame_index >= settings.recent
             if not (few_shared or far or long_ago):
                 return
         view.keyframe = True

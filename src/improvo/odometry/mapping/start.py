@@ -37,7 +37,7 @@ def start_map(
         median depth in it is 1. After a failure the views have neither poses nor points.
     """
     b = buffer[-1]
-    least = settings.start.min_common_tracks
+    least = settings.start.min_points
     a = next((view for view in buffer[:-1] if _shared(view, b) >= least), None)
     if a is None:
         return InitFailure("too few tracks")

@@ -57,7 +57,10 @@ def reference_of(sequence: Sequence, settings: ScaleSettings) -> Trajectory:
             track = read_position_track(name)
             truth, own = _at_frames(track, times), track.times
         else:
-            given = read_trajectory(name)
+            try:
+                given = read_trajectory(name)
+            except InputError as error:
+                raise InputError(f"{error}, or a GPS track (GPX, or a table with latitude and longitude)") from None
             truth, own = poses_at(given, times), given.times
         truth = replace(truth, times=sequence.times)
         span = f" (it lasts from {_when(own[0])} to {_when(own[-1])}, the recording from {_when(times[0])} to "
