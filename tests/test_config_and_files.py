@@ -9,7 +9,15 @@ import pytest
 
 from improvo import config
 from improvo.errors import ConfigError, OutputError
-from improvo.files import MARKER, check_output_folder, make_output_folder, write_json, write_text, written_atomically
+from improvo.files import (
+    MARKER,
+    check_output_file,
+    check_output_folder,
+    make_output_folder,
+    write_json,
+    write_text,
+    written_atomically,
+)
 
 
 @dataclass(frozen=True)
@@ -140,3 +148,30 @@ def test_our_own_folder_may_be_written_again_and_no_other(tmp_path: Path) -> Non
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="is a file"):
         check_output_folder(tmp_path / "file", "run")
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("x")
+    check_output_file(tmp_path / "new" / "camera.yaml")
+    check_output_file(tmp_path / "file")
+    assert not (tmp_path / "new").exists()
+    for path, said in (
+        (tmp_path, "is a folder"),
+        (Path(), "is a folder"),
+        (tmp_path / "file" / "camera.yaml", "is a file, not a folder"),
+        (tmp_path / ("x" * 300), "too long"),
+    ):
+        with pytest.raises(OutputError, match=said):
+            check_output_file(path)
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    with pytest.raises(OutputError, match="no permission"):
+        check_output_file(tmp_path / "camera.yaml")
+
+
+def test_calibrate_looks_at_its_output_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from improvo.cli.main import main
+
+    assert main(["calibrate", str(tmp_path / "missing.mp4"), "-o", str(tmp_path)]) == 2
+    assert "is a folder" in capsys.readouterr().err

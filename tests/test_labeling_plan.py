@@ -126,10 +126,14 @@ def test_the_start_of_a_map_is_a_cost_of_the_recording(
     assert sample.recording == pytest.approx(recording, abs=2.1)
 
 
-def test_recordings_that_cannot_be_opened_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_why_no_recording_can_be_opened_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "empty").mkdir()
     assert main(["label", "--plan", str(tmp_path / "empty")]) == 2
-    assert "cannot be opened" in capsys.readouterr().err
+    assert "the folder is empty" in capsys.readouterr().err
+    playlist = tmp_path / "list.mp4"
+    playlist.write_text("ffconcat version 1.0\nfile other.mp4\n")
+    assert main(["label", "--plan", str(playlist), str(tmp_path / "empty")]) == 2
+    assert "list.mp4: is a text that names other files" in capsys.readouterr().err
 
 
 def test_without_a_plan_the_output_must_be_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

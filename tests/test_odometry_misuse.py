@@ -84,8 +84,9 @@ def test_a_refused_frame_changes_no_later_pose(walk: Sequence) -> None:
         if number % 3 == 1:
             with pytest.raises(InputError):
                 disturbed.track(frame(one.image[:-8]))
-            with pytest.raises(InputError):
-                disturbed.track(frame(one.image, time=float("nan")))
+            for time in (float("nan"), float("-inf"), "1", None, 10**400):
+                with pytest.raises(InputError, match="finite time in seconds"):
+                    disturbed.track(frame(one.image, time=time))  # type: ignore[arg-type]
         disturbed.track(one)
     for running in (plain, disturbed):
         running.finish()

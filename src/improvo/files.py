@@ -171,6 +171,25 @@ def check_output_folder(path: Path, command: str) -> None:
         raise OutputError(f"{path}: no permission to write in {existing}; choose another output folder")
 
 
+def check_output_file(path: Path) -> None:
+    """Refuse a file that cannot be written, before any work is done.
+
+    Raises:
+        OutputError: it is a folder, lies in a file, has an impossible name, or there is no permission.
+    """
+    try:
+        check_path(path)
+    except InputError as error:
+        raise OutputError(str(error)) from None
+    if path.is_dir():
+        raise OutputError(f"{path}: is a folder; give the name of a file in it")
+    existing = next(parent for parent in path.absolute().parents if parent.exists())
+    if not existing.is_dir():
+        raise OutputError(f"{path}: {existing} is a file, not a folder; choose another folder")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise OutputError(f"{path}: no permission to write in {existing}; choose another folder")
+
+
 def make_output_folder(path: Path, command: str) -> None:
     """Create the folder and mark it as made by `command` (checked first, see `check_output_folder`)."""
     check_output_folder(path, command)

@@ -14,6 +14,7 @@ from improvo.cli.flags import add_setting
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
 from improvo.cli.output import figures, next_step, notice, say
 from improvo.errors import ConfigError, InputError
+from improvo.files import check_output_file
 from improvo.self_calibration.settings import SelfCalibrationSettings
 
 if TYPE_CHECKING:
@@ -83,6 +84,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.recording is None:
         raise ConfigError("give a video, or --print-board FILE.pdf to make a board for one")
     settings = settings_from(SelfCalibrationSettings, arguments)
+    check_output_file(arguments.output)
     if arguments.source == "board" or (arguments.source is None and arguments.board is not None):
         _from_board(arguments, settings)
     else:

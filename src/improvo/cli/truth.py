@@ -57,10 +57,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Write FILE and its quality as JSON beside it; print the quality."""
     from improvo.evaluation.truth.make import make_truth
     from improvo.evaluation.truth.structure_from_motion import load_pycolmap
+    from improvo.files import check_output_file
     from improvo.sequences import open_sequence
 
     settings = settings_from(TruthCommandSettings, arguments, _FLAGS)
     load_pycolmap()  # said before any work
+    check_output_file(arguments.output)
     settings = with_found_camera(settings, [arguments.sequence], None, "truth")
     sequence = open_sequence(arguments.sequence, settings.sequence)
     with terminal.stages("step") as told:

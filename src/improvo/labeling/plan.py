@@ -94,7 +94,7 @@ def plan_labels(
     """
     lengths = _lengths(paths, settings)
     if not lengths:
-        raise InputError(f"{paths[0]}: cannot be opened, nor can any other recording that was tried; check the paths")
+        raise InputError(f"no recording can be opened; the first: {_why_not(paths[0], settings)}")
     tried = list(lengths)
     most = _sample_frames(settings)
     count = max(_SAMPLES, _ALL_SAMPLE_FRAMES // max(round(np.mean([min(n, most) for n in lengths.values()])), 1))
@@ -139,6 +139,17 @@ def _lengths(paths: Sequence[Path], settings: RunSettings) -> dict[Path, int]:
             if length:
                 lengths[paths[row]] = length
     return lengths
+
+
+def _why_not(path: Path, settings: RunSettings) -> str:
+    """What is wrong with a recording whose length is not known."""
+    from improvo.sequences import open_sequence
+
+    try:
+        open_sequence(path, settings.sequence)
+    except InputError as error:
+        return str(error)
+    return f"{path}: is a stream, which has no end; record it first"
 
 
 def _sample_frames(settings: RunSettings) -> int:

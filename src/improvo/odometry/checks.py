@@ -43,8 +43,12 @@ def check_time(time: float) -> None:
     Raises:
         InputError: it is not.
     """
-    if not math.isfinite(time):
-        raise InputError(f"time {time}: a frame needs a finite time in seconds")
+    try:
+        finite = math.isfinite(time)
+    except (TypeError, ValueError, OverflowError):
+        finite = False
+    if not finite:
+        raise InputError(f"time {time!r}: a frame needs a finite time in seconds")
 
 
 def check_features(features: Features, width: int | None) -> None:
