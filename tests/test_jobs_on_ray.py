@@ -130,7 +130,7 @@ def test_a_node_that_dies_costs_what_it_had_in_work(nodes, cluster, tmp_path):
         folder.mkdir()
 
     def end_node() -> None:
-        ends = time.monotonic() + 120
+        ends = time.monotonic() + 600
         while len(list(tmp_path.glob("*/nodes"))) < 3 and time.monotonic() < ends:
             time.sleep(0.05)
         nodes.remove_node(third, allow_graceful=False)
@@ -178,7 +178,7 @@ class Killer(threading.Thread):
         self.killed: list[int] = []
 
     def run(self) -> None:
-        ends = time.monotonic() + 300
+        ends = time.monotonic() + 600
         while not self.killed and time.monotonic() < ends:
             for lock in self._folder.rglob(".*.lock"):
                 name = lock.name.removeprefix(".").removesuffix(".lock")

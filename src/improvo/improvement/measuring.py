@@ -29,9 +29,11 @@ from improvo.jobs.crew import Crew
 from improvo.jobs.pool import Workers
 from improvo.labeling.labeled import LabeledSequence, read_labels
 from improvo.labeling.store import DONE, SequenceRecord
+from improvo.locations import fetched
 from improvo.sequences import Sequence as ImageSequence
 from improvo.sequences import open_sequence
 from improvo.stability.rule import IGNORE
+from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, read_observations, read_points_parts
 from improvo.types import Features, Int64
 
 
@@ -141,13 +143,17 @@ def _of_labels(labelled: list[LabeledSequence]) -> dict[str, float]:
     """Track length, share of stable tracks and error over the label tables."""
     observations = tracks = stable = with_label = 0
     errors = []
-    for sequence in labelled:
-        points, rows = sequence.points, sequence.tracks
-        observations, tracks = observations + len(rows), tracks + len(points)
-        counts = points.counts()
-        stable, with_label = stable + counts["stable"], with_label + counts["stable"] + counts["unstable"]
-        chosen = np.isin(rows.track, points.track[points.stability != IGNORE]) & np.isfinite(rows.error)
-        errors.append(rows.error[chosen])
+    for sequence in labelled:  # a part at a time: a long recording does not fit into memory
+        labels = []
+        for points in read_points_parts(fetched(sequence.folder / POINTS_FILE)):
+            tracks += len(points)
+            counts = points.counts()
+            stable, with_label = stable + counts["stable"], with_label + counts["stable"] + counts["unstable"]
+            labels.append(points.track[points.stability != IGNORE])
+        taught = np.concatenate(labels) if labels else np.zeros(0, np.int64)
+        for rows in read_observations(fetched(sequence.folder / TRACKS_FILE)):
+            observations += len(rows.error)
+            errors.append(rows.error[np.isin(rows.track, taught) & np.isfinite(rows.error)])
     known = np.concatenate(errors) if errors else np.zeros(0)
     return {
         "track_length": observations / max(tracks, 1),
