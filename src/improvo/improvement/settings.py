@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from improvo.depth.settings import DepthSettings
 from improvo.errors import ConfigError
@@ -130,5 +130,9 @@ class ImproveSettings:
         return self.recipe == TRACKS or (self.recipe == HELD and not self.held.pairs.whole_frames)
 
     def run_settings(self, sequence: SequenceSettings, frontend: FrontendSettings) -> RunSettings:
-        """The odometry's settings for some frames and a frontend."""
-        return RunSettings(sequence, frontend, self.odometry, self.labels)
+        """The odometry's settings for some frames and a frontend.
+
+        Where no labels teach, none is withheld: a path of doubtful scale still relates frames that are seconds apart.
+        """
+        quality = replace(self.labels.quality, enabled=self.labels.quality.enabled and self.teaches_labels)
+        return RunSettings(sequence, frontend, self.odometry, replace(self.labels, quality=quality))
