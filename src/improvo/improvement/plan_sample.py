@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,8 +20,8 @@ from improvo.improvement.settings import ImproveSettings
 from improvo.jobs.processes import run_in_processes
 from improvo.labeling.labeled import read_labels
 
-_DEPTH_MAPS = 40
-_FEW_STEPS, _MORE_STEPS = 4, 16
+_DEPTH_MAPS = 100  # fewer would have fewer neighbours each
+_FEW_STEPS, _MORE_STEPS = 4, 24
 
 
 @dataclass(frozen=True)
@@ -64,9 +65,11 @@ def _measured(job: _CostJob, tick: Callable[[], None]) -> Costs:
     begun = _processor_seconds()
     make_depth(part, len(posed), job.settings.reference, count)
     depth = (_processor_seconds() - begun) / max(maps, 1)
-    few = _training_seconds(job, part, _FEW_STEPS)
-    step = max(_training_seconds(job, part, _MORE_STEPS) - few, 0.0) / (_MORE_STEPS - _FEW_STEPS)
-    return replace(job.costs, depth=depth, step=step, start=max(few - _FEW_STEPS * step, 0.0), pair=_of_pair(job, part))
+    first = _training_seconds(job, part, _FEW_STEPS)  # with what a process does once: loading torch, compiling
+    few, more = (_training_seconds(job, part, steps) for steps in (_FEW_STEPS, _MORE_STEPS))
+    step = max(more - few, 0.0) / (_MORE_STEPS - _FEW_STEPS)
+    start = max(first - _FEW_STEPS * step, 0.0)
+    return replace(job.costs, depth=depth, step=step, start=start, pair=_of_pair(job, part))
 
 
 def _training_seconds(job: _CostJob, part: ReferencePart, steps: int) -> float:
@@ -81,8 +84,8 @@ def _training_seconds(job: _CostJob, part: ReferencePart, steps: int) -> float:
         steps_per_frame=0.0,
     )
     begun = _processor_seconds()
-    output = job.store.parent / f"training-{steps}"
-    train(TrainingJob(settings, 0, job.weights, output, job.store, (part,), progress=False))
+    with tempfile.TemporaryDirectory(dir=job.store.parent) as output:
+        train(TrainingJob(settings, 0, job.weights, Path(output), job.store, (part,), progress=False))
     return _processor_seconds() - begun
 
 
