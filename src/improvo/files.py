@@ -151,10 +151,7 @@ def check_output_folder(path: Path, command: str) -> None:
     Raises:
         OutputError: the path is a file, a folder with other content or of a later improvo, or cannot be written.
     """
-    try:
-        check_path(path)
-    except InputError as error:
-        raise OutputError(str(error)) from None
+    _check_name(path)
     if path.exists() and not path.is_dir():
         raise OutputError(f"{path}: is a file, not a folder; choose another output folder")
     try:
@@ -177,10 +174,7 @@ def check_output_file(path: Path) -> None:
     Raises:
         OutputError: it is a folder, lies in a file, has an impossible name, or there is no permission.
     """
-    try:
-        check_path(path)
-    except InputError as error:
-        raise OutputError(str(error)) from None
+    _check_name(path)
     if path.is_dir():
         raise OutputError(f"{path}: is a folder; give the name of a file in it")
     existing = next(parent for parent in path.absolute().parents if parent.exists())
@@ -188,6 +182,13 @@ def check_output_file(path: Path) -> None:
         raise OutputError(f"{path}: {existing} is a file, not a folder; choose another folder")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise OutputError(f"{path}: no permission to write in {existing}; choose another folder")
+
+
+def _check_name(path: Path) -> None:
+    try:
+        check_path(path)
+    except InputError as error:
+        raise OutputError(str(error)) from None
 
 
 def make_output_folder(path: Path, command: str) -> None:

@@ -22,7 +22,7 @@ from typing import Any
 from improvo import locations
 from improvo.errors import ImprovoError, OutputError
 from improvo.files import MARKER, make_output_folder, process_exists
-from improvo.locations.claim import ClaimedError
+from improvo.locations.claim import ClaimedError, holder_in
 
 LOCK = ".improvo.lock"
 _BEAT_SECONDS = 5.0
@@ -192,7 +192,7 @@ class _LockFile:
 
     def _content(self) -> dict[str, Any]:
         """What stands in the file. To open and close it once more would give the system's lock away."""
-        return _parsed(os.pread(self._descriptor, _LONGEST, 0))
+        return holder_in(os.pread(self._descriptor, _LONGEST, 0))
 
     def _is_gone(self, holder: dict[str, Any]) -> bool:
         """Whether the process that the file names is dead, or somewhere else without a beat."""
@@ -236,7 +236,7 @@ def _seems_held_here(file: Path) -> bool:
         return True
     try:
         by_system = _lock(descriptor)
-        holder = _parsed(os.pread(descriptor, _LONGEST, 0))
+        holder = holder_in(os.pread(descriptor, _LONGEST, 0))
     except BlockingIOError:
         return True
     finally:
@@ -252,7 +252,7 @@ def holder_of(file: Path) -> str:
     """Who a lock file of another process says holds it, in words; empty where it does not say."""
     try:
         with file.open("rb") as stream:
-            found = _parsed(stream.read(_LONGEST))
+            found = holder_in(stream.read(_LONGEST))
     except OSError:
         found = locations.claimant(file) or {}
     return _words(found) if found else ""
@@ -275,14 +275,6 @@ def _lock(descriptor: int) -> bool:
     except OSError:  # a file system without locks
         return False
     return True
-
-
-def _parsed(content: bytes) -> dict[str, Any]:
-    try:
-        found = json.loads(content)
-    except ValueError:
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def _words(holder: dict[str, Any]) -> str:

@@ -7,12 +7,11 @@ learned. A few minutes; run it again to continue one that was stopped. Without t
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import shlex
 from pathlib import Path
 
 from improvo.cli.output import next_step, say
-from improvo.errors import ImprovoError
+from improvo.errors import ImprovoError, installed
 
 _STEPS = 300
 
@@ -46,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     do("show", "tracks", before)
     do("show", "labels", before)
     do("report", before)
-    if importlib.util.find_spec("torch") is None:
+    if not installed("torch"):
         say("\nThe rest, where the frontend learns from this room, needs an extra: pip install 'improvo[train]'")
         next_step(
             f"open {before / 'report.html'}, or install the extra and run `improvo demo -o {arguments.output}` again"

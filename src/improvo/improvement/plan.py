@@ -14,6 +14,7 @@ from improvo.improvement.estimate import Costs, Estimate, estimate
 from improvo.improvement.plan_sample import measure
 from improvo.improvement.rounds import starting_weights
 from improvo.improvement.settings import ImproveSettings
+from improvo.improvement.split import whole_held_back
 from improvo.labeling.plan import LabelPlan, plan_labels
 from improvo.sequences import open_sequence
 
@@ -59,7 +60,7 @@ def plan_improvement(
         costs = Costs.usual(pixels, _parameters(weights))
         measured = measure(store, weights, settings, replace(costs, frame=once.frame_seconds))
     held_back = round(once.frames * (len(evaluate) / len(paths) if evaluate else settings.split.share))
-    whole = len(evaluate) or (max(round(len(paths) * settings.split.share), 1) if len(paths) > 1 else 0)
+    whole = len(evaluate) or whole_held_back(len(paths), settings.split.share)
     training = once.frames - held_back
     needed = estimate(settings, rounds, training, held_back, pixels, measured or costs, whole)
     return ImprovePlan(once, needed, measured is not None)
@@ -91,7 +92,7 @@ def first_estimate(
     paths = [*sequences, *evaluate]
     pixels = _pixels(paths, settings)
     costs = Costs.usual(pixels, _parameters(starting_weights(settings.frontend.name)))
-    whole = len(evaluate) or (max(round(len(paths) * settings.split.share), 1) if len(paths) > 1 else 0)
+    whole = len(evaluate) or whole_held_back(len(paths), settings.split.share)
     return estimate(settings, rounds, training, held_back, pixels, costs, whole)
 
 

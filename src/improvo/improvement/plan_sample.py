@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import tempfile
 from collections.abc import Callable
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from improvo.errors import ImprovoError
+from improvo.errors import ImprovoError, installed
 from improvo.improvement.estimate import Costs
 from improvo.improvement.measuring import ScoreJob, scores_of
 from improvo.improvement.recipe import TrainingJob, train
@@ -43,7 +42,7 @@ def measure(store: Path, weights: Path, settings: ImproveSettings, usual: Costs)
         settings: of the loop.
         usual: what is not measured is taken from it.
     """
-    if importlib.util.find_spec("torch") is None:
+    if not installed("torch"):
         return None
     found: list[Costs | Exception] = []
     job = _CostJob(store, weights, settings, usual)

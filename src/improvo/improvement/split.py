@@ -97,11 +97,16 @@ def split_whole_sequences(records: Sequence[SequenceRecord], sequence: SequenceS
     paths = [Path(record.path) for record in records if record.state == DONE]
     if len(paths) == 1:
         return replace(split_last_part(paths[0], sequence, share), unusable=unusable)
-    count = min(max(1, round(len(paths) * share)), len(paths) - 1)
+    count = whole_held_back(len(paths), share)
     chosen = {-(-len(paths) * (part + 1) // count) - 1 for part in range(count)}  # rounded up: never the first
     held = [path for row, path in enumerate(paths) if row in chosen]
     rest = [path for row, path in enumerate(paths) if row not in chosen]
     return Split(Part(tuple(rest), sequence), Part(tuple(held), sequence), _words(held), unusable)
+
+
+def whole_held_back(recordings: int, share: float) -> int:
+    """How many of several recordings are held back; 0 of a single one, which is divided."""
+    return min(max(1, round(recordings * share)), recordings - 1)
 
 
 def remembered_split(path: Path, choose: Callable[[], Split]) -> Split:

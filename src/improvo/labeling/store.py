@@ -96,7 +96,8 @@ class LabelStore:
         self.folder = folder
         self._refreshed, self._refresh_seconds = 0.0, 0.0
         made_with = SettingsRecord(folder / SETTINGS_FILE, kind)
-        relabel = relabel or self._holds_only_failures()  # a wrong mask, say: nothing is lost by other settings
+        # failures alone, by a wrong mask, say: nothing is lost by other settings
+        relabel = relabel or (bool(made_with.difference(settings)) and self._holds_only_failures())
         if not relabel:
             made_with.check(settings, _OTHER_SETTINGS)
         if not made_with.path.is_file():

@@ -136,8 +136,11 @@ def read_claim(place: Place, path: Path) -> dict[str, Any] | None:
         return content
 
     content = place.tries(read, "read", LocationReadError)
-    if content is None:
-        return None
+    return None if content is None else holder_in(content)
+
+
+def holder_in(content: bytes) -> dict[str, Any]:
+    """What a lock file says of its holder; empty where it says nothing that can be read."""
     try:
         found = json.loads(content)
     except ValueError:

@@ -82,7 +82,7 @@ class Page:
         colours = colours or {}
         largest = max((value for _, value, _ in rows), default=0.0) or 1.0
         body = "".join(
-            f'<tr><td>{_swatch(colours.get(name))}{plain(name)}</td><td>{plain(words)}</td><td class="bar">'
+            f'<tr><td>{swatch(colours.get(name))}{plain(name)}</td><td>{plain(words)}</td><td class="bar">'
             f'<i style="width:{100 * value / largest:.1f}%"></i></td></tr>'
             for name, value, words in rows
         )
@@ -145,7 +145,8 @@ class Page:
         )
 
 
-def _swatch(colour: str | None) -> str:
+def swatch(colour: str | None) -> str:
+    """Markup: a patch of a colour (CSS) before a word; nothing without one."""
     return "" if colour is None else f'<i class="swatch" style="background:{colour}"></i> '
 
 

@@ -15,7 +15,7 @@ from improvo.odometry.verdict.told_verdicts import verdict_lines, verdict_of
 from improvo.odometry.verdict.verdict import DOUBTFUL
 from improvo.report.charts import line_chart
 from improvo.report.map_picture import map_png, trusted_points
-from improvo.report.page import Page, plain
+from improvo.report.page import Page, plain, swatch
 from improvo.report.page_data import frames_data, per_frame, scene_data
 from improvo.report.palettes import PALETTES, Palette
 from improvo.report.plain_words import LABEL_WORDS, warnings
@@ -39,7 +39,7 @@ pink: doubtful; yellow: the frame below{truth}</span><span class="legend" id="sc
 fingers zoom and move; arrow keys and + - too. One finger up or down scrolls the page.</p>
 <p class="note">{counts}</p>"""
 
-_TRUTH = '; <i class="swatch" style="background:#7fffd4"></i> true path, each segment aligned'
+_TRUTH = f"; {swatch('#7fffd4')}true path, each segment aligned"
 
 _FRAMES = """
 <div class="controls only-screen"><button type="button" id="frame-play">Play</button>
@@ -239,7 +239,7 @@ def _css(palette: Palette, label: str) -> str:
 
 def _legend(palette: Palette, labels: Sequence[str]) -> list[str]:
     """Markup: each label behind its colour."""
-    return [f'<i class="swatch" style="background:{_css(palette, label)}"></i> {label}' for label in labels]
+    return [f"{swatch(_css(palette, label))}{label}" for label in labels]
 
 
 def _gradient(palette: Palette) -> str:

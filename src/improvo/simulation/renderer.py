@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from improvo.errors import InputError, MissingExtraError
+from improvo.errors import InputError, imported
 from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import rigid
 from improvo.simulation.scene import Scene
@@ -118,9 +118,7 @@ def _import_mujoco() -> ModuleType:
     if sys.platform == "linux" and "MUJOCO_GL" not in os.environ and "DISPLAY" not in os.environ:
         os.environ["MUJOCO_GL"] = "osmesa" if ctypes.util.find_library("OSMesa") else "egl"
     try:
-        import mujoco
-    except ImportError:
-        raise MissingExtraError("simulate", "simulate") from None
+        mujoco: ModuleType = imported("mujoco", "simulate", "simulate")
     except (AttributeError, RuntimeError, OSError) as error:
         raise _no_display(error) from None
     return mujoco

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from improvo.training.photometric_batch import augment_batch
 from improvo.training.picture_store import MaskStore, PictureStore, on_device
 from improvo.training.pictures import Pictures, Source
 from improvo.training.posed import PosedSequence, overlapping_pairs
-from improvo.training.posed_frames import PosedFrames
+from improvo.training.posed_frames import Carried, PosedFrames
 from improvo.training.random_views import random_views
 from improvo.training.teacher import Teacher
 from improvo.training.view_points import cell_corners, cell_keypoints, warped, within
@@ -40,6 +41,13 @@ class _Plan:
     posed: int  # so many pairs, the first ones, are related by depth and poses
     size: tuple[int, int]  # width, height of the views
     whole: bool = False  # the views are the frames as they are
+
+
+class _ByDepth(NamedTuple):
+    """Points of the posed pairs."""
+
+    inverse_depth: Tensor  # (P, N) in picture a, 0 where unknown
+    carried: Carried  # to picture b
 
 
 class DevicePairs:
@@ -240,7 +248,7 @@ class DevicePairs:
         found, known = [], []
         for one, seen in ((plan, logits[:count]), (turned, logits[count:])):
             keypoints, scores = cell_keypoints(seen)
-            absent = self._carry(one, keypoints, absent=True)[1]
+            absent = self._absent(one, keypoints)
             rank, best = scores.masked_fill(~absent, -torch.inf).topk(most, dim=1)
             found.append(keypoints.gather(1, best[..., None].expand(-1, -1, 2)))
             known.append(rank.isfinite())
@@ -253,35 +261,44 @@ class DevicePairs:
             "negative_b": torch.cat([points["valid"], known[1]], dim=1),
         }
 
-    def _carry(self, plan: _Plan, points: Tensor, absent: bool = False) -> tuple[Tensor, Tensor]:
-        """Pixels of view b (B, N, 2) of pixels of view a, and whether both pictures show the place.
-
-        With `absent` instead whether it is certain that view b does not show it.
-        """
-        count = len(plan.rows)
-        in_a = warped(np.asarray(np.linalg.inv(plan.view_from_picture[:count])), points)
-        in_b = warped(plan.b_from_a, in_a)
-        visible = torch.ones_like(in_a[..., 0], dtype=torch.bool)
-        if plan.posed:
-            rows = plan.rows[: plan.posed]
-            inverse = self.frames.depths.sample(rows[:, 0], in_a[: plan.posed])
-            carried = self.frames.carry(rows, in_a[: plan.posed], inverse)
-            in_b[: plan.posed] = carried.places
-            visible[: plan.posed] = self.frames.shown(rows, carried, self.settings.pairs.depth_tolerance)
+    def _carry(self, plan: _Plan, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels of view b (B, N, 2) of pixels of view a, and whether both pictures show the place."""
+        in_a, in_b, posed = self._in_pictures(plan, points)
         sizes = on_device(self.store.sizes[plan.rows].astype(np.float32), points.device)
-        if absent:
-            known = torch.ones_like(visible) if self.masks is None else self.masks.used(plan.rows[:, 0], in_a)
-            if plan.posed:
-                known[: plan.posed] &= inverse > 0
-            there = warped(plan.view_from_picture[count:], in_b)
-            size = on_device(np.array([plan.size], np.float32), there.device)
-            margin = self.settings.masked_pixels
-            return there, known & within(in_a, sizes[:, 0]) & ~within(there + margin, size + 2 * margin)
-        visible = visible & within(in_a, sizes[:, 0]) & within(in_b, sizes[:, 1])
+        visible = within(in_a, sizes[:, 0]) & within(in_b, sizes[:, 1])
+        if posed is not None:
+            shown = self.frames.shown(plan.rows[: plan.posed], posed.carried, self.settings.pairs.depth_tolerance)
+            visible[: plan.posed] &= shown
         if self.masks is not None:
             visible = visible & self.masks.used(plan.rows[:, 0], in_a) & self.masks.used(plan.rows[:, 1], in_b)
-        result = warped(plan.view_from_picture[count:], torch.where(visible[..., None], in_b, 0.0))
+        result = warped(plan.view_from_picture[len(plan.rows) :], torch.where(visible[..., None], in_b, 0.0))
         return result, visible & within(result, on_device(np.array([plan.size], np.float32), points.device))
+
+    def _absent(self, plan: _Plan, points: Tensor) -> Tensor:
+        """Of pixels of view a (B, N, 2), whether it is certain that view b does not show the place."""
+        in_a, in_b, posed = self._in_pictures(plan, points)
+        sizes = on_device(self.store.sizes[plan.rows].astype(np.float32), points.device)
+        known = within(in_a, sizes[:, 0])
+        if posed is not None:
+            known[: plan.posed] &= posed.inverse_depth > 0
+        if self.masks is not None:
+            known = known & self.masks.used(plan.rows[:, 0], in_a)
+        there = warped(plan.view_from_picture[len(plan.rows) :], in_b)
+        size = on_device(np.array([plan.size], np.float32), there.device)
+        margin = self.settings.masked_pixels
+        return known & ~within(there + margin, size + 2 * margin)
+
+    def _in_pictures(self, plan: _Plan, points: Tensor) -> tuple[Tensor, Tensor, _ByDepth | None]:
+        """Pixels of view a in picture a and in picture b (B, N, 2), and what depth says of those of posed pairs."""
+        in_a = warped(np.asarray(np.linalg.inv(plan.view_from_picture[: len(plan.rows)])), points)
+        in_b = warped(plan.b_from_a, in_a)
+        if not plan.posed:
+            return in_a, in_b, None
+        rows = plan.rows[: plan.posed]
+        inverse = self.frames.depths.sample(rows[:, 0], in_a[: plan.posed])
+        carried = self.frames.carry(rows, in_a[: plan.posed], inverse)
+        in_b[: plan.posed] = carried.places
+        return in_a, in_b, _ByDepth(inverse, carried)
 
     def _by_pictures(self, plan: _Plan, points_a: Tensor, points_b: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Partners (B, N, 2) of pixels of the a views, and which are known: by depth, and as the pictures have them."""

@@ -21,7 +21,7 @@ from improvo.training.descriptor_metric import MetricSettings, Scatter, found_ag
 from improvo.training.held_settings import DevicePairSettings
 from improvo.training.metrics import METRICS, append_metrics
 from improvo.training.photometric import augment
-from improvo.training.posed import FramePairs, PosedSequence, overlapping_pairs
+from improvo.training.posed import PosedSequence, overlapping_pairs
 from improvo.training.posed_frames import PosedFrames
 from improvo.training.settings import PhotometricSettings, ViewSettings
 from improvo.training.stage_folder import SETTINGS, WEIGHTS, commit_of_code, stage_folder
@@ -107,7 +107,7 @@ def _frame_pairs(posed: Sequence[PosedSequence], frontend: NetworkFrontend, sett
         number = int(rng.choice(useful, p=weights / weights.sum()))
         found = pairs[number]
         assert found is not None
-        first, second = _drawn(found, rng)
+        first, second = found.frames[found.draw_row(rng)].tolist()
         a, b = features(number, first), features(number, second)
         rows = frames.first[number] + np.array([[first, second]])
         in_a = torch.from_numpy(a.keypoints)[None]
@@ -115,12 +115,6 @@ def _frame_pairs(posed: Sequence[PosedSequence], frontend: NetworkFrontend, sett
         shown = frames.shown(rows, carried, _DEPTH_TOLERANCE)[0].numpy()
         places = carried.places[0].numpy().astype(np.float64)
         yield a, b, found_again(b.keypoints, places, shown, settings.right_px)
-
-
-def _drawn(pairs: FramePairs, rng: np.random.Generator) -> tuple[int, int]:
-    chosen = int(rng.integers(len(pairs.starts) - 1))
-    first, second = pairs.frames[int(rng.integers(pairs.starts[chosen], pairs.starts[chosen + 1]))]
-    return int(first), int(second)
 
 
 def _view_pairs(posed: Sequence[PosedSequence], frontend: NetworkFrontend, settings: MetricSettings) -> Iterator[Pair]:

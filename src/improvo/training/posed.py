@@ -45,11 +45,15 @@ class FramePairs:
 
     def draw(self, rng: np.random.Generator) -> tuple[int, int, Float64, Float64]:
         """Two frames of a class drawn evenly, and a place (2,) in either that both show."""
-        chosen = int(rng.integers(len(self.starts) - 1))
-        row = int(rng.integers(self.starts[chosen], self.starts[chosen + 1]))
+        row = self.draw_row(rng)
         places = self.places[row]
         place = places[rng.choice(np.flatnonzero(np.isfinite(places[:, 0])))].astype(np.float64)
         return int(self.frames[row, 0]), int(self.frames[row, 1]), place[:2], place[2:]
+
+    def draw_row(self, rng: np.random.Generator) -> int:
+        """The row of a pair of a class drawn evenly."""
+        chosen = int(rng.integers(len(self.starts) - 1))
+        return int(rng.integers(self.starts[chosen], self.starts[chosen + 1]))
 
 
 def block_inverse_depth(depth: NDArray[np.floating], side: int = 4, largest_step: float = 1.06) -> Float32:

@@ -1,10 +1,10 @@
-"""YAML and JSON from files that anyone may have written; every fault is a ValueError with one line."""
+"""YAML, JSON and XML from files that anyone may have written; every fault is a ValueError with one line."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from improvo.errors import InputError
 from improvo.untrusted.limits import (
@@ -15,6 +15,9 @@ from improvo.untrusted.limits import (
     MAX_YAML_BYTES,
     MAX_YAML_NODES,
 )
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
 
 
 def load_yaml(text: str) -> Any:
@@ -86,6 +89,22 @@ def read_json_file(path: Path, mend: str) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InputError(f"{path}: is damaged (it holds no JSON object); {mend}")
     return content
+
+
+def load_xml(text: str) -> Element:
+    """The root of a document that defines no entities, which a few lines could blow up to gigabytes.
+
+    Raises:
+        ValueError: not XML, or it defines entities.
+    """
+    from xml.etree import ElementTree
+
+    if "<!ENTITY" in text or "<!DOCTYPE" in text:
+        raise ValueError("it defines entities")
+    try:
+        return ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(str(error)) from None
 
 
 def is_number(text: str) -> bool:

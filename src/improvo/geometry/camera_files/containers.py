@@ -10,7 +10,7 @@ from typing import Any
 from improvo.errors import InputError
 from improvo.geometry.camera_files.calibration import MEND
 from improvo.untrusted.arrays import read_npz
-from improvo.untrusted.text import load_json, load_yaml
+from improvo.untrusted.text import load_json, load_xml, load_yaml
 
 _MAX_DEPTH = 64  # of elements
 
@@ -112,13 +112,9 @@ def _ini(content: str, path: Path) -> dict[str, Any]:
 
 def _xml(content: str, path: Path) -> Any:
     """OpenCV's FileStorage, and Metashape's camera calibration."""
-    from xml.etree import ElementTree
-
     try:
-        if "<!ENTITY" in content or "<!DOCTYPE" in content:
-            raise ValueError("it defines entities")
-        root = ElementTree.fromstring(content)
-    except (ElementTree.ParseError, ValueError) as error:
+        root = load_xml(content)
+    except ValueError as error:
         raise InputError(f"{path}: is not valid XML ({error}); {MEND}") from None
     metashape = root if root.tag == "calibration" else root.find(".//calibration")
     if metashape is not None:

@@ -125,9 +125,8 @@ class AttachedDetector:
             moved = motion[motion > _MOVED * self._noise]
             self._most_moved = max(self._most_moved, len(moved))
             slow = len(moved) < _MIN_MOVING or np.median(moved) < self._settings.min_flow * self._noise
-            ending = (
-                self._most_moved >= _MIN_MOVING and len(moved) < 0.5 * self._most_moved
-            )  # while a logo's tracks stay
+            # tracks of the world end, while a logo's stay
+            ending = self._most_moved >= _MIN_MOVING and len(moved) < 0.5 * self._most_moved
             if not few_left and ((slow and not ending) or view.frame_index - anchor.frame_index < _SHORTEST):
                 return
             self._weigh(anchor, view)

@@ -105,12 +105,11 @@ class LocalMap:
         """
         assert view.cam_from_world is not None
         assert neighbour.cam_from_world is not None
-        poses = [each.cam_from_world for each in self.history if each.cam_from_world is not None]
-        centers = np.array([se3.inverse(pose)[:3, 3] for pose in poses]).reshape(-1, 3)
-        frames = np.diff([each.frame_index for each in self.history if each.cam_from_world is not None])
-        fastest = float(
-            (np.linalg.norm(np.diff(centers, axis=0), axis=1) / np.maximum(np.abs(frames), 1)).max(initial=0.0)
-        )
+        posed = [(each.frame_index, each.cam_from_world) for each in self.history if each.cam_from_world is not None]
+        centers = np.array([se3.inverse(pose)[:3, 3] for _, pose in posed]).reshape(-1, 3)
+        steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+        frames = np.maximum(np.abs(np.diff([index for index, _ in posed])), 1)
+        fastest = float((steps / frames).max(initial=0.0))
         center = se3.inverse(view.cam_from_world)[:3, 3]
         seen = np.linalg.norm(self.store.xyz[view.points[view.observed]] - center, axis=1)
         far = np.linalg.norm(center - se3.inverse(neighbour.cam_from_world)[:3, 3])

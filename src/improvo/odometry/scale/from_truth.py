@@ -46,23 +46,9 @@ def reference_of(sequence: Sequence, settings: ScaleSettings) -> Trajectory:
             )
         name, span = str(sequence.path), ""
     else:
-        name = settings.reference
-        shift = 0.0 if settings.began is None else time_in_seconds(settings.began)
-        if not np.isfinite(shift):
-            raise InputError(
-                f"--scale truth: {settings.began} is no time; give a date such as 2026-05-01T10:00:00Z, or seconds"
-            )
-        times = sequence.times + shift
-        if is_position_track(name):
-            track = read_position_track(name)
-            truth, own = _at_frames(track, times), track.times
-        else:
-            try:
-                given = read_trajectory(name)
-            except InputError as error:
-                raise InputError(f"{error}, or a GPS track (GPX, or a table with latitude and longitude)") from None
-            truth, own = poses_at(given, times), given.times
-        truth = replace(truth, times=sequence.times)
+        name, times = settings.reference, sequence.times + _shift(settings.began)
+        given, own = _of_file(name, times)
+        truth = replace(given, times=sequence.times)
         span = f" (it lasts from {_when(own[0])} to {_when(own[-1])}, the recording from {_when(times[0])} to "
         span += f"{_when(times[-1])})"
     if truth.valid.sum() < 3:
@@ -71,6 +57,26 @@ def reference_of(sequence: Sequence, settings: ScaleSettings) -> Trajectory:
             f"needed{span}; bring both to one clock: --scale truth FILE BEGAN says when the recording began"
         )
     return truth
+
+
+def _shift(began: str | None) -> float:
+    """Seconds from the recording's clock to that of the reference."""
+    shift = 0.0 if began is None else time_in_seconds(began)
+    if not np.isfinite(shift):
+        raise InputError(f"--scale truth: {began} is no time; give a date such as 2026-05-01T10:00:00Z, or seconds")
+    return shift
+
+
+def _of_file(name: str, times: Float64) -> tuple[Trajectory, Float64]:
+    """The reference at some times, and its own times."""
+    if is_position_track(name):
+        track = read_position_track(name)
+        return _at_frames(track, times), track.times
+    try:
+        given = read_trajectory(name)
+    except InputError as error:
+        raise InputError(f"{error}, or a GPS track (GPX, or a table with latitude and longitude)") from None
+    return poses_at(given, times), given.times
 
 
 def _at_frames(track: PositionTrack, times: Float64) -> Trajectory:
