@@ -89,8 +89,8 @@ class ImproveSettings:
     labels: LabelSettings = field(default_factory=LabelSettings)
     split: SplitSettings = field(default_factory=SplitSettings)
     reference: ReferenceSettings = field(default_factory=ReferenceSettings)
-    # held: descriptors from dense pairs of frames, the other heads held to the start's. metric: a linear map of the
-    # descriptors from such pairs, in closed form. tracks: all heads from tracks
+    # held: descriptors from dense pairs of frames, the other heads held to the start's, then a linear map of the
+    # descriptors from such pairs, in closed form. metric: that map alone. tracks: all heads from tracks
     recipe: str = HELD
     control: bool = False  # also train, from the same start, by homographies of the same frames alone, and show it
     minutes: float = 0.0  # that training may take in each round; 0: as many steps as the following say
@@ -107,7 +107,8 @@ class ImproveSettings:
             ),
         )
     )
-    metric: MetricSettings = field(default_factory=MetricSettings)  # of the recipe `metric`
+    then_metric: bool = True  # the recipe `held` ends with what `metric` does, on the descriptors that it has trained
+    metric: MetricSettings = field(default_factory=MetricSettings)  # of the recipe `metric`, and of that
     training: OdometryTrainingSettings = field(  # of the recipe `tracks`
         default_factory=lambda: OdometryTrainingSettings(
             optimiser=OptimiserSettings(steps=1000, decay_steps=350, learning_rate=5e-4)
