@@ -66,7 +66,7 @@ def improve(
         settings: all of them; `settings.frontend.name` is where the loop starts.
         rounds: of labelling, training and validation.
         evaluate: recordings to hold back; without any, some of `sequences`, or the last part of a single one.
-        workers: sequences labelled at a time, a process for each.
+        workers: sequences labelled at a time, a process with one core for each; by default one, in this process.
         ray: address of a Ray cluster that labels them, see `improvo.jobs.on_ray`.
         data: what the model card says about the recordings.
         progress: is told progress and results.
