@@ -164,7 +164,9 @@ def _plan(arguments: argparse.Namespace, settings: ImproveSettings) -> int:
 
     compile_odometry(notice)
     with progress("sample", "frame") as shown:
-        plan = plan_improvement(arguments.sequences, settings, arguments.rounds, arguments.evaluate, shown.advance)
+        plan = plan_improvement(
+            arguments.sequences, settings, arguments.rounds, arguments.evaluate, shown.advance, arguments.after
+        )
     say_improve_plan(plan, arguments.rounds)
     next_step("the same without --plan and with -o OUT does it")
     return 0

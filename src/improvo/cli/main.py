@@ -55,6 +55,8 @@ class _Text(HelpFormatter, argparse.RawDescriptionHelpFormatter):
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point. Returns the exit status: 0 done, 2 an error that the user can correct, 130 interrupted."""
     words = list(sys.argv[1:] if argv is None else argv)
+    # Descriptors are matched in small products of matrices: threads of OpenBLAS make that slower.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("MPLCONFIGDIR", str(cache_folder() / "matplotlib"))  # made by matplotlib, if it is used
     try:
         arguments = parser_for(words).parse_args(words)

@@ -58,7 +58,7 @@ class Rounds:
         settings: of the loop.
         train: what trains.
         data: what the model card says about the recordings.
-        workers: sequences that are labelled at a time.
+        workers: sequences that are labelled at a time, see `Crew`.
         ray: address of a Ray cluster that labels, measures and, where it has GPUs and this machine has none, trains.
         progress: is told progress and results.
     """
