@@ -22,7 +22,6 @@ from improvo.frontend.weights import Weights, find_weights, load_weights, save_w
 from improvo.improvement.improve import Improvement, improve
 from improvo.improvement.recipe import TrainingJob
 from improvo.improvement.settings import ImproveSettings, SplitSettings, ValidationSettings
-from improvo.odometry.settings import OdometrySettings, StartSettings
 from improvo.stability.settings import LabelQualitySettings, LabelSettings
 
 _HELD = ImproveSettings().held
@@ -32,7 +31,6 @@ SETTINGS = ImproveSettings(
     frontend=FrontendSettings(SPOILED, max_keypoints=250),
     # a dozen frames of one wall, by a spoiled network, are no evidence that the odometry is right
     labels=LabelSettings(min_observations=6, quality=LabelQualitySettings(enabled=False)),
-    odometry=OdometrySettings(start=StartSettings(max_homography_ratio=0.9)),  # the room is mostly one wall
     held=LABELS_TEACH,
     split=SplitSettings(0.3),
     validation=ValidationSettings(
@@ -75,7 +73,8 @@ class FakeTraining:
         rows = [{"step": step, "loss": 1.0 / step} for step in (1, 2, 3)]
         (output / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
         card = replace(weights.card, activation_ranges={}, training={"stage": "odometry", "seconds": 1, "steps": 3})
-        save_weights(output / "weights.safetensors", weights.tensors, card)
+        job.weights.parent.mkdir(exist_ok=True)
+        save_weights(job.weights, weights.tensors, card)
         return rows[-1]
 
 

@@ -158,10 +158,8 @@ def test_costly_failures_are_tried_again_ever_more_rarely(monkeypatch: pytest.Mo
         return InitFailure("the first views do not fit together", costly=True)
 
     monkeypatch.setattr(robust, "start_map", failing)
-    settings = OdometrySettings()
-    settings = replace(settings, start=replace(settings.start, max_cooldown=10))
-    Run(walk(60), settings)
-    assert np.diff(tried).tolist() == [3, 6, 10, 10, 10, 10]
+    Run(walk(60))
+    assert np.diff(tried).tolist() == [3, 6, 12, 24]
 
 
 def test_cheap_failures_are_tried_again_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,9 +174,8 @@ def test_cheap_failures_are_tried_again_at_once(monkeypatch: pytest.MonkeyPatch)
     assert tried == list(range(1, 20))
 
 
-def test_the_initialisation_buffer_is_bounded_and_gives_up_its_oldest_frames() -> None:
-    settings = OdometrySettings()
-    settings = replace(settings, start=replace(settings.start, max_buffered=5))
-    run = Run([observe(room(), TRUTH[0], seed=i) for i in range(20)], settings)  # a still camera
+def test_the_initialisation_buffer_is_bounded_and_gives_up_its_oldest_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robust, "_MAX_BUFFERED", 5)
+    run = Run([observe(room(), TRUTH[0], seed=i) for i in range(20)])  # a still camera
     assert [view.frame_index for view in run.final] == list(range(20))
     assert not run.odometry.trajectory.valid.any()

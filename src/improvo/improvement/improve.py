@@ -25,8 +25,8 @@ from improvo.improvement.progress import ImprovementProgress
 from improvo.improvement.recipe import Train, TrainingJob
 from improvo.improvement.reference import HELD_BACK, TRAINING, ReferencePart
 from improvo.improvement.report import write_report
-from improvo.improvement.rounds import Rounds, starting_weights
-from improvo.improvement.settings import DEFAULT_START, ImproveSettings
+from improvo.improvement.rounds import Rounds
+from improvo.improvement.settings import ImproveSettings
 from improvo.improvement.split import Split
 from improvo.improvement.validation import Validation, is_better, rule, summary
 
@@ -84,8 +84,7 @@ def improve(
     if output.resolve() in earlier.folders:
         raise ConfigError(f"{output}: cannot follow itself; choose another output folder")
     sequences = earlier.without_known(sequences)
-    named = settings.frontend.name
-    first_weights = earlier.weights if earlier.weights and named == DEFAULT_START else starting_weights(named)
+    first_weights = earlier.first_weights(settings.frontend.name)
     make_output_folder(output, COMMAND)
     with locked(output):
         folder = ImproveFolder(output, sequences, evaluate, settings, first_weights, after)

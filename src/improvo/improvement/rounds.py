@@ -189,7 +189,7 @@ class Rounds:
         else:
             self._train(job)
         images = calibration_images(part, self._images)
-        write_calibrated(candidate.training / "weights.safetensors", candidate.weights, images)
+        write_calibrated(job.weights, candidate.weights, images)
 
     def _trains_there(self) -> bool:
         """Whether the GPU is on the cluster, and not here."""

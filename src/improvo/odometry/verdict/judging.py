@@ -15,12 +15,12 @@ class SegmentJudge:
 
     Args:
         camera: pinhole camera of the views.
-        settings: of the odometry; `verdict` and `objective` are used.
+        settings: of the odometry; `verdict` is used.
     """
 
     def __init__(self, camera: Camera, settings: OdometrySettings) -> None:
         self._settings = settings
-        self._evidence = EvidenceCheck(camera, settings.verdict, settings.objective)
+        self._evidence = EvidenceCheck(camera)
         self._alarms: list[str] = []
         self._suspicions: list[str] = []
 
