@@ -17,7 +17,7 @@ from rendered_walk import _TEXTURE, CAMERA, _texture, render_with_depth
 from simulated_features import hand_motion
 
 from improvo.cli.main import main
-from improvo.errors import ConfigError, InputError
+from improvo.errors import ConfigError, InputError, OutputError
 from improvo.geometry import se3
 from improvo.geometry.alignment import align_points
 from improvo.geometry.trajectory_files import read_trajectory, write_trajectory
@@ -231,6 +231,23 @@ def test_contradictions_leave_the_run_as_it_is(
         with pytest.raises(InputError, match=what):
             apply_scale(sequence, run, ask, settings)
     assert before == {file.name: file.read_bytes() for file in run.folder.iterdir() if file.is_file()}
+
+
+def test_what_is_stopped_between_two_units_is_no_result(
+    finished: tuple[Sequence, RunSummary], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence, run = finished
+    ask = scale_source(sequence, ScaleSettings("truth"))
+    assert ask is not None
+
+    def full(*_: object, **__: object) -> None:
+        raise OutputError("the disk is full")
+
+    monkeypatch.setattr("improvo.odometry.scale.apply.write_trajectory", full)
+    with pytest.raises(OutputError):
+        apply_scale(sequence, run, ask, ScaleSettings("truth"))
+    with pytest.raises(InputError, match=r"has no run\.json"):  # the map is in metres, the trajectory is not
+        RunFolder(run.folder)
 
 
 def test_several_distances_are_averaged_and_contradictions_are_named(finished: tuple[Sequence, RunSummary]) -> None:
