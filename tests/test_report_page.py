@@ -287,6 +287,21 @@ def test_a_label_store_has_a_page_with_what_failed_and_why(finished_run: Path, t
     assert main(["report", str(labels / "walk"), "-o", str(tmp_path / "one.html")]) == 0
 
 
+def test_a_wide_table_and_the_map_fit_on_paper(page: Path, tmp_path: Path, browser: Any) -> None:
+    share = Measure("share", "of right matches")
+    rounds = [Round(name, {"share": 0.5}) for name in ("before", "round 1")]
+    header = ["right matches", *(f"{gap} frames ({gap / 30:.1f} s)" for gap in (6, 12, 18, 24))]
+    rows = [["round 1, share, 8 px", *["+0.1 % (-0.3 to +0.4)"] * 4]]
+    write_improvement_page(tmp_path / "wide.html", "Improvement", "", [share], rounds, gains=[header, *rows])
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    paper = {"width": 718, "height": 1000, "deviceScaleFactor": 1, "mobile": False}  # A4 without its margins
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", paper)
+    browser.get((tmp_path / "wide.html").as_uri())
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= 718
+    browser.get(page.as_uri())
+    assert browser.execute_script("return document.getElementById('scene').clientHeight") < 700
+
+
 def test_improvement_is_told_with_its_setbacks(tmp_path: Path) -> None:
     measures = [
         Measure("success", "share of pairs", digits=2),
