@@ -75,7 +75,8 @@ class FakeTraining:
         rows = [{"step": step, "loss": 1.0 / step} for step in (1, 2, 3)]
         (output / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
         card = replace(weights.card, activation_ranges={}, training={"stage": "odometry", "seconds": 1, "steps": 3})
-        save_weights(output / "weights.safetensors", weights.tensors, card)
+        job.weights.parent.mkdir(exist_ok=True)
+        save_weights(job.weights, weights.tensors, card)
         return rows[-1]
 
 

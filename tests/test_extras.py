@@ -1,4 +1,4 @@
-"""What the base install does without SciPy and matplotlib, and what says that it needs one of them."""
+"""What the base install does without SciPy, matplotlib and torch, and what says that it needs one of them."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "src" / "improvo"
 WITHOUT = """
 import sys
-sys.modules["scipy"] = sys.modules["matplotlib"] = None
+sys.modules["scipy"] = sys.modules["matplotlib"] = sys.modules["torch"] = None
 from improvo.cli.main import main
 sys.exit(main(sys.argv[1:]))
 """
 
 
 def improvo(*words: str) -> subprocess.CompletedProcess[str]:
-    """A command in a process where neither can be imported."""
+    """A command in a process where none of them can be imported."""
     return subprocess.run([sys.executable, "-c", WITHOUT, *words], capture_output=True, text=True, check=False)
 
 
@@ -41,6 +41,18 @@ def test_pictures_of_labels(out: Path) -> None:
     ended = improvo("show", "labels", str(out))
     assert ended.returncode == 0, ended.stderr
     assert list((out / "pictures").glob("labels*.png"))
+
+
+def test_the_demo_does_all_but_the_training(tmp_path: Path) -> None:
+    ended = improvo("demo", "-o", str(tmp_path / "demo"), "--frontend", "orb")
+    assert ended.returncode == 0, ended.stderr
+    assert "pip install 'improvo[plots]'" in ended.stdout
+    assert "pip install 'improvo[train]'" in ended.stdout
+    assert (tmp_path / "demo" / "run" / "report.html").exists()
+    assert sorted(file.name for file in (tmp_path / "demo" / "run" / "pictures").iterdir()) == [
+        "labels.png",
+        "tracks.png",
+    ]
 
 
 @pytest.mark.parametrize(

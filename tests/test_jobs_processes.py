@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from improvo.errors import ImprovoError, MissingExtraError
+from improvo.errors import ConfigError, ImprovoError, MissingExtraError
 from improvo.jobs.crew import TRIES, Crew
 from improvo.jobs.processes import Tick, run_here, run_in_processes
 from improvo.jobs.workers import WorkerDiedError
@@ -155,9 +155,12 @@ def test_a_crew_gives_results_in_order_and_the_first_error():
     assert [number for number, _ in Crew().results(halve, [8, 2, 4], ticks.append)] == [4, 1, 2]
     assert sum(ticks) == 14
     assert Crew(2).results(halve, [6, 2]) == [(3, "1"), (1, "1")]
+    assert Crew(1).results(halve, [6]) == [(3, "1")]  # one worker has one core, too
     with pytest.raises(ValueError, match="3 is odd"):
         Crew().results(halve, [2, 3, 5])
     assert Crew().results(halve, []) == []
+    with pytest.raises(ConfigError, match="at least 1, not 0"):
+        Crew(0)
 
 
 def test_a_job_whose_worker_dies_is_done_again_and_then_set_aside(tmp_path):

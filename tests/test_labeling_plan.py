@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -177,6 +178,38 @@ def test_whole_recordings_are_not_labelled_twice(tmp_path: Path, monkeypatch: py
     plan = plan_improvement(walks, ImproveSettings(), 1)
     assert plan.labelings == pytest.approx(1.2)
     assert not plan.measured
+
+
+def test_a_plan_after_a_folder_that_is_not_there_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    walk = str(write_walk(tmp_path / "attic", frames=4, seed=0))
+    for after in (tmp_path / "missing", tmp_path):
+        assert main(["improve", "--plan", walk, "--after", str(after)]) == 2
+        error = capsys.readouterr().err.strip().splitlines()[-1]
+        assert error.startswith(f"improvo: {after}: is no finished folder of `improvo improve`")
+
+
+def test_a_plan_after_a_folder_is_of_the_new_recordings_with_its_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old, new = (write_walk(tmp_path / name, frames=4, seed=0) for name in ("old", "new"))
+    before = tmp_path / "before"
+    before.mkdir()
+    shutil.copy(find_weights("superpoint-small"), before / "weights.safetensors")
+    (before / "settings.yaml").write_text("rounds: 1\n")
+    part = {"paths": [str(old)], "sequence": {}}
+    (before / "split.json").write_text(json.dumps({"training": part, "held_back": part, "words": "old"}))
+    planned: list[tuple[list[Path], str]] = []
+
+    def plan(paths: list[Path], settings: RunSettings, **_: object) -> LabelPlan:
+        planned.append((paths, settings.frontend.name))
+        return plan_of(frames=1000)
+
+    monkeypatch.setattr("improvo.improvement.plan.plan_labels", plan)
+    monkeypatch.setattr("improvo.improvement.plan.measure", lambda *_: None)
+    plan_improvement([old, new], ImproveSettings(), 1, after=before)
+    assert planned == [([new], str(before / "weights.safetensors"))]
+    with pytest.raises(InputError, match="add new ones"):
+        plan_improvement([old], ImproveSettings(), 1, after=before)
 
 
 def test_the_parts_of_the_loop_are_measured(tmp_path: Path) -> None:

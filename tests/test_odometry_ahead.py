@@ -1,4 +1,4 @@
-"""The look-ahead: frames in order, computed by one other thread, errors when their turn comes."""
+"""The look-ahead: frames in order, computed by one other thread where there is a core for it, errors in their turn."""
 
 from __future__ import annotations
 
@@ -9,9 +9,25 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from improvo.jobs import workers
 from improvo.odometry.ahead import detected_ahead
 from improvo.odometry.visual_odometry import MatchedFeatures
 from improvo.types import Features, Frame
+
+
+@pytest.fixture(params=["one core", "two cores"])
+def cores(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    given(monkeypatch, 1 if request.param == "one core" else 2)
+
+
+@pytest.fixture
+def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    given(monkeypatch, 2)
+
+
+def given(monkeypatch: pytest.MonkeyPatch, cores: int, limit: str = "") -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", limit)
+    monkeypatch.setattr(workers, "available_cores", lambda: cores)
 
 
 def frames(count: int, read: list[int] | None = None, fails_at: int | None = None) -> Iterator[Frame]:
@@ -33,6 +49,7 @@ def match(features: Features) -> MatchedFeatures:
     return MatchedFeatures(features, np.zeros((1, 4), np.float32), None)
 
 
+@pytest.mark.usefixtures("cores")
 def test_frames_come_in_order_each_with_its_own_features() -> None:
     seen = list(detected_ahead(frames(20), detect, match))
     assert [each.frame.source_index for each in seen] == list(range(20))
@@ -40,11 +57,18 @@ def test_frames_come_in_order_each_with_its_own_features() -> None:
     assert all(min(each.reading, each.detecting, each.matching) >= 0.0 for each in seen)
 
 
+@pytest.mark.usefixtures("cores")
 def test_no_frames_at_all() -> None:
     assert list(detected_ahead([], detect, match)) == []
 
 
-def test_all_work_is_done_in_one_other_thread() -> None:
+@pytest.mark.parametrize(
+    ("cores", "limit", "elsewhere"), [(2, "", True), (2, "2", True), (8, "4,2", True), (2, "1", False), (1, "", False)]
+)
+def test_all_work_is_done_in_one_other_thread_unless_there_is_no_core_for_it(
+    cores: int, limit: str, elsewhere: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given(monkeypatch, cores, limit)
     threads = set()
 
     def noted(features: Features) -> MatchedFeatures:
@@ -53,9 +77,10 @@ def test_all_work_is_done_in_one_other_thread() -> None:
 
     list(detected_ahead(frames(10), detect, noted))
     assert len(threads) == 1
-    assert threading.get_ident() not in threads
+    assert (threading.get_ident() not in threads) == elsewhere
 
 
+@pytest.mark.usefixtures("two_cores")
 def test_it_reads_no_more_than_a_few_frames_ahead() -> None:
     read: list[int] = []
     ahead = detected_ahead(frames(100, read), detect, match)
@@ -65,6 +90,7 @@ def test_it_reads_no_more_than_a_few_frames_ahead() -> None:
     ahead.close()
 
 
+@pytest.mark.usefixtures("cores")
 @pytest.mark.parametrize("fails_at", [0, 1, 5])
 def test_an_error_comes_after_everything_before_it(fails_at: int) -> None:
     ahead = detected_ahead(frames(10, fails_at=fails_at), detect, match)
@@ -73,6 +99,7 @@ def test_an_error_comes_after_everything_before_it(fails_at: int) -> None:
         next(ahead)
 
 
+@pytest.mark.usefixtures("two_cores")
 def test_leaving_early_leaves_no_thread() -> None:
     before = threading.active_count()
     for each in detected_ahead(frames(100), detect, match):

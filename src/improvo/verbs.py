@@ -89,7 +89,7 @@ def label(
     sequences: Sequence[PathLike],
     output: PathLike,
     settings: RunSettings | None = None,
-    workers: int = 1,
+    workers: int | None = None,
     ray: str | None = None,
 ) -> list[SequenceRecord]:
     """Stability labels for many sequences, as `improvo label` makes them; what is done already is not done again.
@@ -98,7 +98,7 @@ def label(
         sequences: paths of recordings.
         output: folder of the label store.
         settings: all numbers; by default those of `LabelRunSettings`.
-        workers: sequences at a time, a process for each.
+        workers: sequences at a time, a process with one core for each; by default one, in this process, on all cores.
         ray: address of a Ray cluster that does the work.
 
     Returns:
@@ -217,7 +217,7 @@ def improve(
     settings: ImproveSettings | None = None,
     rounds: int = 1,
     evaluate: Sequence[PathLike] = (),
-    workers: int = 1,
+    workers: int | None = None,
     after: PathLike | None = None,
 ) -> Improvement:
     """The loop: label, train, validate, and keep the better weights, as `improvo improve` does it.
@@ -228,7 +228,7 @@ def improve(
         settings: all numbers.
         rounds: of labelling, training and validation.
         evaluate: recordings to hold out; without any, some of `sequences`, or the last part of a single one.
-        workers: sequences labelled at a time.
+        workers: sequences labelled at a time, a process with one core for each; by default one, in this process.
         after: finished folder of an earlier call, whose recordings are replayed and must not get worse.
 
     Raises:

@@ -11,7 +11,7 @@ import shlex
 from pathlib import Path
 
 from improvo.cli.output import next_step, say
-from improvo.errors import ImprovoError, installed
+from improvo.errors import PLOTS_MISSING, ImprovoError, installed, plots_installed
 
 _STEPS = 300
 
@@ -41,7 +41,10 @@ def run(arguments: argparse.Namespace) -> int:
     say(f"A simulated room of 140 frames, with its true poses: {bundled_sequence()}")
     do("run", recording, "-o", before, "--frontend", arguments.frontend)
     do("evaluate", "trajectory", before, recording)
-    do("show", "map", before)
+    if plots_installed():
+        do("show", "map", before)
+    else:
+        say(f"\nA picture of the map needs an extra: {PLOTS_MISSING}; the map is also in the report below.")
     do("show", "tracks", before)
     do("show", "labels", before)
     do("report", before)

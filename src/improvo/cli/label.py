@@ -66,7 +66,8 @@ def add_job_arguments(parser: argparse.ArgumentParser) -> None:
         "--workers",
         type=int,
         metavar="N",
-        help="sequences labelled at a time, a process for each (default: 1; with --ray, the cluster's cores)",
+        help="sequences labelled at a time, a process with one core for each (default: one, on all cores; with --ray, "
+        "as many as the cluster has cores)",
     )
     parser.add_argument(
         "--ray",

@@ -8,6 +8,7 @@ from improvo.errors import ConfigError, MissingExtraError, installed
 from improvo.frontend.channel_pruning import without_dead_channels
 from improvo.frontend.settings import NetworkSettings
 from improvo.frontend.weights import Weights
+from improvo.jobs.workers import thread_limit
 from improvo.types import Float32
 
 
@@ -60,12 +61,13 @@ def open_runtime(weights: Weights, settings: NetworkSettings) -> Runtime:
             "setting `precision`: int8 needs weights with activation ranges; `improvo weights calibrate` adds them"
         )
     int8 = calibrated and settings.precision != "float32"
+    threads = settings.threads or thread_limit()
     if name == "onnxruntime":
         from improvo.frontend.runtime_onnxruntime import OnnxRuntime
 
-        return OnnxRuntime(weights, int8=int8, threads=settings.threads)
+        return OnnxRuntime(weights, int8=int8, threads=threads)
     if not installed("openvino"):
         raise MissingExtraError("running a network without OpenVINO", "onnxruntime")
     from improvo.frontend.runtime_openvino import OpenVinoRuntime
 
-    return OpenVinoRuntime(weights, int8=int8, threads=settings.threads)
+    return OpenVinoRuntime(weights, int8=int8, threads=threads)

@@ -31,7 +31,7 @@ class NetworkOptions:
     # auto: openvino on the CPU, onnxruntime where that is not installed; torch where device is cuda
     runtime: Literal["auto", "openvino", "onnxruntime", "torch"] = "auto"
     precision: Literal["auto", "float32", "int8", "float16"] = "auto"  # auto: int8 if the weights are calibrated for it
-    threads: int = 0  # 0: as many as the machine has
+    threads: int = 0  # 0: one in a worker process, otherwise as many as the machine has or OMP_NUM_THREADS says
     device: Literal["cpu", "cuda"] = "cpu"  # cuda needs torch
 
     def __post_init__(self) -> None:

@@ -9,6 +9,8 @@ from pathlib import Path
 from improvo.continuation import SettingsRecord
 from improvo.errors import InputError
 from improvo.improvement.reference import TRAINING, ReferencePart, reference_parts
+from improvo.improvement.rounds import starting_weights
+from improvo.improvement.settings import DEFAULT_START
 from improvo.improvement.split import Split, read_split
 
 SETTINGS, SPLIT, REFERENCE, WEIGHTS = "settings.yaml", "split.json", "reference", "weights.safetensors"
@@ -29,6 +31,18 @@ class Earlier:
     def weights(self) -> Path | None:
         """The latest; None without any folder."""
         return self.folders[0] / WEIGHTS if self.folders else None
+
+    def first_weights(self, named: str) -> Path:
+        """The weights that the loop starts from: the latest, unless the settings name another frontend.
+
+        Args:
+            named: frontend of the settings.
+
+        Raises:
+            ConfigError: a frontend that has no weights.
+            InputError: no such file.
+        """
+        return self.weights if self.weights and named == DEFAULT_START else starting_weights(named)
 
     def without_known(self, sequences: Sequence[Path]) -> list[Path]:
         """The recordings that none of them has had.

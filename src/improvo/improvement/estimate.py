@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from improvo.errors import OutputError
-from improvo.improvement.recipe import steps_of
+from improvo.improvement.recipe import stages, steps_of
 from improvo.improvement.settings import HELD, METRIC, TRACKS, ImproveSettings
 from improvo.terminal import counted
 
@@ -19,7 +19,7 @@ _SECONDS_PER_STEP = 0.2  # one core of an AMD EPYC with AVX-512 BF16, 2026-11-28
 _MIB_PER_REMEMBERED = 2.1  # frame of 640x480, with what is held to
 _SECONDS_PER_PAIR = 0.08
 _GAPS = 3  # between the frames of a pair
-_SECONDS_PER_FRAME_PAIR = 0.02  # of the recipe `metric`, beside the features of its frames
+_SECONDS_PER_FRAME_PAIR = 0.02  # of the stage `metric`, beside the features of its frames
 _LARGER = 4.0  # times as long for a step of the full network
 _MIB = 2**20
 _TORCH_MIB = 900  # of a process that trains
@@ -92,9 +92,11 @@ def estimate(
     deep = min(training, reference.most_training) + min(held_back, reference.most_held_back)
     steps = steps_of(settings, training)
     trainings = rounds + settings.control
-    each = costs.start + (60 * settings.minutes if settings.minutes else steps * costs.step)
-    if settings.recipe == METRIC:
-        each = training * costs.frame + steps * _SECONDS_PER_FRAME_PAIR
+    each, planned = 0.0, stages(settings)
+    if planned != (METRIC,):
+        each += costs.start + (60 * settings.minutes if settings.minutes else steps * costs.step)
+    if METRIC in planned:
+        each += min(training, reference.most_training) * costs.frame + settings.metric.pairs * _SECONDS_PER_FRAME_PAIR
     # of a whole recording the reference has the labels of the start already
     labeled = training if settings.teaches_labels else 0
     again = 0 if settings.recipe == TRACKS or recordings else labeled + held_back

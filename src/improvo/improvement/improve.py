@@ -25,8 +25,8 @@ from improvo.improvement.progress import ImprovementProgress
 from improvo.improvement.recipe import Train, TrainingJob
 from improvo.improvement.reference import HELD_BACK, TRAINING, ReferencePart
 from improvo.improvement.report import write_report
-from improvo.improvement.rounds import Rounds, starting_weights
-from improvo.improvement.settings import DEFAULT_START, ImproveSettings
+from improvo.improvement.rounds import Rounds
+from improvo.improvement.settings import ImproveSettings
 from improvo.improvement.split import Split
 from improvo.improvement.validation import Validation, is_better, rule, summary
 
@@ -66,7 +66,7 @@ def improve(
         settings: all of them; `settings.frontend.name` is where the loop starts.
         rounds: of labelling, training and validation.
         evaluate: recordings to hold back; without any, some of `sequences`, or the last part of a single one.
-        workers: sequences labelled at a time, a process for each.
+        workers: sequences labelled at a time, a process with one core for each; by default one, in this process.
         ray: address of a Ray cluster that labels them, see `improvo.jobs.on_ray`.
         data: what the model card says about the recordings.
         progress: is told progress and results.
@@ -84,8 +84,7 @@ def improve(
     if output.resolve() in earlier.folders:
         raise ConfigError(f"{output}: cannot follow itself; choose another output folder")
     sequences = earlier.without_known(sequences)
-    named = settings.frontend.name
-    first_weights = earlier.weights if earlier.weights and named == DEFAULT_START else starting_weights(named)
+    first_weights = earlier.first_weights(settings.frontend.name)
     make_output_folder(output, COMMAND)
     with locked(output):
         folder = ImproveFolder(output, sequences, evaluate, settings, first_weights, after)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from improvo.errors import InputError
 from improvo.frontend.weights import load_weights
+from improvo.improvement.earlier import earlier_runs
 from improvo.improvement.estimate import Costs, Estimate, estimate
 from improvo.improvement.plan_sample import measure
 from improvo.improvement.rounds import starting_weights
@@ -39,17 +40,22 @@ def plan_improvement(
     rounds: int,
     evaluate: Sequence[Path] = (),
     on_frames: Callable[[int], None] = lambda count: None,
+    after: Path | None = None,
 ) -> ImprovePlan:
     """Label a sample with the weights that the loop starts from, and reckon.
 
+    What an earlier loop left is replayed and judged too. That costs little beside the rest, and is not counted.
+
     Args:
-        sequences, settings, rounds, evaluate: see `improve`.
+        sequences, settings, rounds, evaluate, after: see `improve`.
         on_frames: is told the number of further frames of the sample processed.
 
     Raises:
-        InputError: none of the samples could be labelled, or weights that cannot be read.
+        InputError: no sample could be labelled, weights cannot be read, or `after` is no finished folder.
     """
-    weights = starting_weights(settings.frontend.name)
+    earlier = earlier_runs(after)
+    sequences = earlier.without_known(sequences)
+    weights = earlier.first_weights(settings.frontend.name)
     frontend = replace(settings.frontend, name=str(weights))
     paths = list(dict.fromkeys([*sequences, *evaluate]))
     pixels = _pixels(paths, settings)

@@ -81,6 +81,7 @@ def _training_seconds(job: _CostJob, part: ReferencePart, steps: int) -> float:
             job.settings.training, optimiser=replace(job.settings.training.optimiser, steps=steps, decay_steps=1)
         ),
         steps_per_frame=0.0,
+        then_metric=False,  # its cost is that of the features
     )
     begun = _processor_seconds()
     with tempfile.TemporaryDirectory(dir=job.store.parent) as output:

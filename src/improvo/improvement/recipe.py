@@ -1,4 +1,4 @@
-"""How a round trains: the recipes, their controls, and how many steps they take."""
+"""How a round trains: the stages of the recipes, their controls, and how many steps they take."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from improvo.errors import InputError
+from improvo.frontend.weights import load_weights, save_weights
 from improvo.improvement.reference import ReferencePart
-from improvo.improvement.settings import HELD, METRIC, ImproveSettings
+from improvo.improvement.settings import HELD, METRIC, TRACKS, ImproveSettings
 from improvo.labeling.store import DONE, read_records
 
 if TYPE_CHECKING:
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
     from improvo.training.posed import PosedSequence
 
 _FEWEST = 300  # steps, however short the training part is
+_WEIGHTS = "weights.safetensors"
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ class TrainingJob:
     settings: ImproveSettings
     seed: int
     start: Path  # weights
-    output: Path
+    output: Path  # folder of the first stage; each later one has a folder of its name in it
     labels: Path  # label store of the training part, made with the start of this training
     reference: tuple[ReferencePart, ...]  # of the training part
     control: bool = False  # by homographies of the same frames alone
@@ -35,14 +38,39 @@ class TrainingJob:
     data: tuple[DataSource, ...] = ()
     progress: bool = True
 
+    @property
+    def weights(self) -> Path:
+        """Where the last stage leaves its weights."""
+        return self._folder(len(stages(self.settings)) - 1) / _WEIGHTS
+
+    def of_stage(self, number: int) -> TrainingJob:
+        """What one stage does: it starts from the weights of the one before it."""
+        start = self._folder(number - 1) / _WEIGHTS if number else self.start
+        return replace(self, start=start, output=self._folder(number))
+
+    def _folder(self, number: int) -> Path:
+        return self.output / stages(self.settings)[number] if number else self.output
+
 
 Train = Callable[[TrainingJob], dict[str, Any]]
 
 
+def stages(settings: ImproveSettings) -> tuple[str, ...]:
+    """What a training does, one after the other, named as the recipes that do one of them alone."""
+    last = (METRIC,) if settings.recipe == HELD and settings.then_metric else ()
+    return (settings.recipe, *last)
+
+
 def train(job: TrainingJob) -> dict[str, Any]:
-    """Train as the recipe says; the last row of metrics."""
-    recipes = {HELD: _train_held, METRIC: _train_metric}
-    return recipes.get(job.settings.recipe, _train_tracks)(job)
+    """Train as the recipe says, stage after stage; the last row of metrics of all of them.
+
+    Every stage goes on where it was stopped. One that has nothing left to do takes the time of looking.
+    """
+    trains = {HELD: _train_held, METRIC: _train_metric, TRACKS: _train_tracks}
+    row: dict[str, Any] = {}
+    for number, stage in enumerate(stages(job.settings)):
+        row |= trains[stage](job.of_stage(number))
+    return row
 
 
 def steps_of(settings: ImproveSettings, frames: int) -> int:
@@ -61,7 +89,6 @@ def steps_of(settings: ImproveSettings, frames: int) -> int:
 
 
 def _train_held(job: TrainingJob) -> dict[str, Any]:
-    from improvo.frontend.weights import load_weights
     from improvo.training.held_training import train_held
     from improvo.training.pictures import Pictures, Source
 
@@ -91,7 +118,14 @@ def _train_metric(job: TrainingJob) -> dict[str, Any]:
 
     settings = job.settings.metric
     settings = replace(settings, seed=job.seed, two_frames=settings.two_frames and not job.control)
-    return train_metric(_teaching(job, settings.longer_side), settings, job.output, job.start, job.data)
+    try:
+        return train_metric(_teaching(job, settings.longer_side), settings, job.output, job.start, job.data)
+    except InputError:  # too few keypoints were found again, of which another stage may have learned all the same
+        if job.settings.recipe == METRIC:
+            raise
+        weights = load_weights(job.start)
+        save_weights(job.output / _WEIGHTS, weights.tensors, weights.card)
+        return {}
 
 
 def _teaching(job: TrainingJob, longer_side: int) -> list[PosedSequence]:

@@ -58,7 +58,7 @@ class Rounds:
         settings: of the loop.
         train: what trains.
         data: what the model card says about the recordings.
-        workers: sequences that are labelled at a time.
+        workers: sequences that are labelled at a time, see `Crew`.
         ray: address of a Ray cluster that labels, measures and, where it has GPUs and this machine has none, trains.
         progress: is told progress and results.
     """
@@ -189,7 +189,7 @@ class Rounds:
         else:
             self._train(job)
         images = calibration_images(part, self._images)
-        write_calibrated(candidate.training / "weights.safetensors", candidate.weights, images)
+        write_calibrated(job.weights, candidate.weights, images)
 
     def _trains_there(self) -> bool:
         """Whether the GPU is on the cluster, and not here."""

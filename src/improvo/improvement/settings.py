@@ -89,25 +89,28 @@ class ImproveSettings:
     labels: LabelSettings = field(default_factory=LabelSettings)
     split: SplitSettings = field(default_factory=SplitSettings)
     reference: ReferenceSettings = field(default_factory=ReferenceSettings)
-    # held: descriptors from dense pairs of frames, the other heads held to the start's. metric: a linear map of the
-    # descriptors from such pairs, in closed form. tracks: all heads from tracks
+    # held: descriptors from dense pairs of frames, the other heads held to the start's, then a linear map of the
+    # descriptors from such pairs, in closed form. metric: that map alone. tracks: all heads from tracks
     recipe: str = HELD
     control: bool = False  # also train, from the same start, by homographies of the same frames alone, and show it
     minutes: float = 0.0  # that training may take in each round; 0: as many steps as the following say
     # for each frame of the training part, at least 300 in all and at most `held.optimiser.steps`; 0: exactly those
-    steps_per_frame: float = 3.0
+    steps_per_frame: float = 2.0
     held: HeldSettings = field(
         default_factory=lambda: HeldSettings(
             frozen_layers=4,  # whose features of a frame are remembered
             fixed_statistics=True,
             scale=28.0,
-            pairs=DevicePairSettings(group=1, whole_frames=1, alone=250, keypoint_share=0.7),
+            pairs=DevicePairSettings(
+                group=1, whole_frames=1, alone=250, keypoint_share=0.7, largest_gap=5.0, least_overlap=0.1
+            ),
             optimiser=OptimiserSettings(  # 1200 steps take 4 minutes on a core with bfloat16
-                steps=1200, batch_size=2, learning_rate=3e-4, decay_steps=400, warmup_steps=50, workers=0
+                steps=1200, batch_size=2, learning_rate=1e-3, decay_steps=400, warmup_steps=50, workers=0
             ),
         )
     )
-    metric: MetricSettings = field(default_factory=MetricSettings)  # of the recipe `metric`
+    then_metric: bool = True  # the recipe `held` ends with what `metric` does, on the descriptors that it has trained
+    metric: MetricSettings = field(default_factory=MetricSettings)  # of the recipe `metric`, and of that
     training: OdometryTrainingSettings = field(  # of the recipe `tracks`
         default_factory=lambda: OdometryTrainingSettings(
             optimiser=OptimiserSettings(steps=1000, decay_steps=350, learning_rate=5e-4)

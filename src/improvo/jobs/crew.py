@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from improvo.errors import ConfigError
 from improvo.jobs.on_ray import run_on_ray
 from improvo.jobs.processes import Job, Result, Tick, run_here, run_in_processes
 from improvo.jobs.workers import WorkerDiedError
@@ -18,12 +19,20 @@ class Crew:
     """The same for all steps of a command.
 
     Args:
-        workers: jobs at a time, a process for each; one, or with `ray` as many as the cluster has cores, if None.
+        workers: jobs at a time, a process with one core for each. If None, one after another in this process, which
+            uses what cores are free, or with `ray` as many as the cluster has cores.
+
+    Raises:
+        ConfigError: fewer than one worker.
         ray: address of a Ray cluster, see `improvo.jobs.on_ray`.
     """
 
     workers: int | None = None
     ray: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.workers is not None and self.workers < 1:
+            raise ConfigError(f"workers: must be at least 1, not {self.workers}")
 
     def do(
         self,
@@ -56,10 +65,10 @@ class Crew:
 
             if self.ray is not None:
                 run_on_ray(work, waiting, take, on_ticks, self.ray, self.workers, gpus)
-            elif len(jobs) == 1 or (self.workers or 1) <= 1:
+            elif self.workers is None or len(jobs) == 1 < self.workers:
                 run_here(work, waiting, take, on_ticks)
             else:
-                run_in_processes(work, waiting, take, on_ticks, min(self.workers or 1, len(waiting)))
+                run_in_processes(work, waiting, take, on_ticks, min(self.workers, len(waiting)))
             waiting, tries = again, tries + 1
 
     def results(

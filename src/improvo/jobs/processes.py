@@ -48,7 +48,7 @@ def run_in_processes(
     on_ticks: Callable[[int], None],
     workers: int,
 ) -> None:
-    """As `run_here`, in `workers` fresh processes with one BLAS thread each; results come as they are ready.
+    """As `run_here`, in `workers` fresh processes with one core each; results come as they are ready.
 
     A process that dies is a `WorkerDiedError` of the job that it had; another takes its place for the jobs that wait.
 

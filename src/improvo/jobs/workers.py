@@ -31,6 +31,17 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def thread_limit() -> int:
+    """How many threads may work at a time in this process, by `OMP_NUM_THREADS`: one in a worker; 0 for no limit."""
+    said = os.environ.get("OMP_NUM_THREADS", "").split(",")[0].strip()
+    return int(said) if said.isdecimal() else 0
+
+
+def has_one_core() -> bool:
+    """Whether a second thread would only take the processor away from the first."""
+    return thread_limit() == 1 or available_cores() == 1
+
+
 @contextmanager
 def one_thread_each() -> Iterator[None]:
     """For the processes that start meanwhile: libraries read the number of their threads when they load."""

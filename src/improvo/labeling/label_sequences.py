@@ -88,7 +88,8 @@ def label_sequences(
         paths: of the recordings.
         folder: of the label store, see `improvo.labeling.store`.
         settings: of the odometry and the labels.
-        workers: sequences at a time, a process for each; one, or with `ray` as many as the cluster has cores, if None.
+        workers: sequences at a time, a process with one core for each. If None, one after another in this process, or
+            with `ray` as many as the cluster has cores.
         pack: whether to keep the frames beside the labels.
         relabel: where the store was made with other settings, clear it instead of refusing.
         ray: address of a Ray cluster that does the work, see `improvo.jobs.on_ray`.

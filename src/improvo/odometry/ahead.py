@@ -1,4 +1,4 @@
-"""Look-ahead: a second thread reads, detects and matches while the backend adjusts, so that two cores are used."""
+"""Look-ahead: a second thread reads, detects and matches while the backend adjusts, where there is a core for it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
+from improvo.jobs.interrupts import interrupts_wait
+from improvo.jobs.workers import has_one_core
 from improvo.odometry.alarms.world_keypoints import AHEAD
 from improvo.odometry.visual_odometry import MatchedFeatures
 from improvo.types import Features, Frame
@@ -26,12 +28,13 @@ class DetectedFrame:
 def detected_ahead(
     frames: Iterable[Frame], detect: Callable[[Frame], Features], match: Callable[[Features], MatchedFeatures]
 ) -> Iterator[DetectedFrame]:
-    """The frames in order with their features and matches, computed ahead by one worker thread.
+    """The frames in order with their features and matches, computed ahead by one other thread.
 
-    An error of a frame is raised when its turn comes, so that everything before it is processed.
+    With one core they are computed when their turn comes, by the thread that asks: a second one would only make both
+    wait. An error of a frame is raised when its turn comes, so that everything before it is processed.
 
     Args:
-        frames: read in the worker thread.
+        frames: read where they are detected.
         detect: features of a frame.
         match: matches a frame's features with those of the frame before; called in order.
     """
@@ -48,6 +51,13 @@ def detected_ahead(
         matched = match(features)
         return DetectedFrame(frame, matched, read - start, detected - read, time.perf_counter() - detected)
 
+    if has_one_core():
+        while True:
+            with interrupts_wait():
+                here = next_frame()
+            if here is None:
+                return
+            yield here
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="detect") as worker:
         pending: list[Future[DetectedFrame | None]] = [worker.submit(next_frame) for _ in range(AHEAD)]
         try:

@@ -75,7 +75,6 @@ def train_metric(
         training = {
             **weights.card.training,
             "metric": {"start": start.name, "settings": values, "pairs": pairs, "correspondences": scatter.count},
-            "steps": pairs,
         }
         # the map changes no activation, so that the ranges for int8 stay
         card = replace(weights.card, data=tuple(sources.values()), training=training, commit=commit_of_code())
