@@ -144,11 +144,11 @@ def test_a_map_contradicted_later_ends_its_segment_and_the_next_takes_its_last_f
 def test_each_contradicted_map_of_the_same_frames_speaks_against_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
     contradicts_at(monkeypatch, 30, 45)
     twice = Run(walk(60)).odometry.segments[0].verdict.evidence
-    assert [words[:5] for words in twice if "contradicted" in words] == ["map 1", "map 2"]
+    assert "each of 2 former maps of these frames was contradicted by two-view geometry" in twice
     contradicts_at(monkeypatch, 75)
     first, second = Run(walk(110)).odometry.segments
-    assert not any("map 1" in words for words in first.verdict.evidence)
-    assert any("map 1" in words for words in second.verdict.evidence)
+    assert not any("a former map" in words for words in first.verdict.evidence)
+    assert any("a former map" in words for words in second.verdict.evidence)
 
 
 def test_frames_of_different_segments_have_different_worlds() -> None:

@@ -142,8 +142,9 @@ class RobustMapper(Mapper):
         if self._lens.factor != 1.0:
             self._events.focal_length(self._buffer[0].frame_index, self._lens.factor, "the segment is doubtful")
             self._judge.alarm(f"the focal length is about {self._lens.factor:.2f} times that of the camera as given")
-        for number in range(1, self._contradicted + 1):
-            self._judge.suspicion(f"map {number} of these frames was contradicted by two-view geometry")
+        if self._contradicted:
+            maps = "a former map" if self._contradicted == 1 else f"each of {self._contradicted} former maps"
+            self._judge.suspicion(f"{maps} of these frames was contradicted by {_TWO_VIEWS}", self._contradicted)
         self._result.begin_segment()
         self._result.give_up(each for each in self._buffer if each.cam_from_world is None)
         self._health = HealthCheck(self._camera, self._settings, self._descriptor_distance)

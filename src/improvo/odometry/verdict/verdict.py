@@ -59,6 +59,7 @@ def judge(
     settings: VerdictSettings,
     alarms: tuple[str, ...] = (),
     suspicions: tuple[str, ...] = (),
+    halvings: int = 1,
 ) -> Verdict:
     """The verdict of a segment by the spread of its path, and by what else was seen.
 
@@ -66,7 +67,8 @@ def judge(
         spread: of the paths from the parts of the evidence; None where the segment is too short for one.
         settings: the limits.
         alarms: in plain words; each makes the segment doubtful.
-        suspicions: in plain words; each halves the error that is enough for a doubt.
+        suspicions: in plain words; where there is one, a smaller error is enough for a doubt,
+        halvings: by half each.
     """
     if spread is None:
         return Verdict(DOUBTFUL if alarms else NOT_JUDGED, evidence=(*alarms, "too few keyframes to judge the path"))
@@ -78,7 +80,7 @@ def judge(
     evidence = [*alarms, *suspicions, _in_words(spread, error)]
     evidence += [words for words in of_lens[:1] if words not in alarms]
     evidence += [f"frames {first} to {last}: the scale is not determined" for first, last in uncertain]
-    limit = settings.max_error * 0.5 ** len(suspicions)
+    limit = settings.max_error * 0.5 ** (halvings if suspicions else 0)
     word = RIGHT if error <= limit and not alarms else DOUBTFUL
     return Verdict(word, error, spread.noise_px, tuple(evidence), uncertain)
 
