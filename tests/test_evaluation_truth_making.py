@@ -73,7 +73,7 @@ def test_what_does_not_fit_on_the_disk_is_refused_before_any_work(
     assert main([*words, "--max-features", "10000"]) == 2
     message = capsys.readouterr().err.splitlines()
     assert len(message) == 1
-    assert "truth.work: needs about 41 MB, and 1 MB are free" in message[0]
+    assert "truth.work: needs about 57 MB, and 1 MB are free" in message[0]
     assert not (tmp_path / "truth.work" / "images").exists()
 
 

@@ -29,7 +29,7 @@ from improvo.types import Float64, Int64
 
 MIN_TRACK = 3  # images that must see a point for its depth to count
 MAX_POINT_ERROR = 2.0  # pixels
-_FEATURE_BYTES = 250  # of a feature in the database, with its matches
+_FEATURE_BYTES = 350  # of a feature in the database, with its matches
 _CHUNK = 8  # images or pairs between two steps of the progress
 
 Progress = Callable[[str, int, int], None]  # stage, done, of how many
@@ -143,15 +143,11 @@ def reconstruct(
 
 def _check_space(folder: Path, needed: int) -> None:
     """Refuse before any work what would not fit, since a full disk ends COLMAP and the process that it is part of."""
-    there, free = (
-        sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()),
-        shutil.disk_usage(folder).free,
-    )
-    if free < needed - there:
-        raise OutputError(
-            f"{folder}: needs about {(needed - there) / 1e6:.0f} MB, and {free / 1e6:.0f} MB are free; free some space, "
-            "or choose another folder"
-        )
+    needed -= sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        sizes = f"needs about {needed / 1e6:.0f} MB, and {free / 1e6:.0f} MB are free"
+        raise OutputError(f"{folder}: {sizes}; free some space, or choose another folder")
 
 
 def read_reconstruction(folder: Path) -> Reconstruction:
