@@ -218,7 +218,12 @@ def test_what_is_wrong_is_said_in_plain_words() -> None:
     assert "2 segments" in words(report(segments=[{"first": 0}, {"first": 6}]))
     verdict = {"word": "doubtful", "evidence": ["the parts disagree"], "uncertain": [], "error_percent": 8.0}
     doubted = {"number": 0, "first": 0, "last": 9, "verdict": verdict}
-    assert "Segment 0 (frames 0 to 9) is doubtful: the parts disagree." in words(report(segments=[doubted]))
+    said = words(report(segments=[doubted]))
+    assert "Segment 0 (frames 0 to 9) is doubtful: the parts disagree." in said
+    assert "makes no labels" in said
+    assert "zoomed" not in said
+    zoomed = {**doubted, "verdict": {**verdict, "evidence": ["the focal length changes"]}}
+    assert "zoomed" in words(report(segments=[zoomed]))
     assert "Check the calibration" in words(report(), error=2.5)
     skipped = [{"index": 3, "source": "a.png", "reason": "truncated"}]
     assert "a.png: truncated" in words(report(input={"skipped": skipped, "notes": []}))

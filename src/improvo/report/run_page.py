@@ -93,7 +93,9 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
     )
     page.heading("What to look out for")
     page.warnings(warnings(report, shown, brightness, median_error), "Nothing: every frame has a pose, in one segment.")
-    page.paragraph(" ".join(f"{line[0].upper()}{line[1:]}." for line in verdict_lines(report)))
+    believed = [line for line in verdict_lines(report) if line not in verdict_lines(report, only=DOUBTFUL)]
+    if believed:
+        page.paragraph(" ".join(f"{line[0].upper()}{line[1:]}." for line in believed))
     if len(run.trajectory):
         _map_section(page, run, palette, truth)
     _frames_section(page, run, data, palette, missing)
