@@ -7,6 +7,7 @@ import re
 import shutil
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -318,4 +319,10 @@ def test_improvement_is_told_with_its_setbacks(tmp_path: Path) -> None:
     assert pair.index("before: matches") < pair.index("round 2: matches") < pair.index("</div>")
     assert "&lt;one&gt;" in text
     write_improvement_page(tmp_path / "none.html", "Improvement", "", measures, rounds, best=0)
-    assert "round 2, not kept: matches" in (tmp_path / "none.html").read_text()
+    none = (tmp_path / "none.html").read_text()
+    assert "round 2, not kept: matches" in none
+    assert "Nothing: the weights are those at the start." in none
+    assert "<h2>Labels" in none
+    unlabelled = [replace(entry, labels={}) for entry in rounds]
+    write_improvement_page(tmp_path / "held.html", "Improvement", "", measures, unlabelled)
+    assert "<h2>Labels" not in (tmp_path / "held.html").read_text()

@@ -202,7 +202,7 @@ def _labels_section(page: Page, run: RunFolder, palette: Palette) -> None:
     page.paragraph(
         f"A track of at least {rule['min_observations']} observations is stable if its mean re-projection error is "
         f"at most {rule['stable_mean_error']:g} px, unstable if its largest is at least "
-        f"{rule['unstable_max_error']:g} px, and ignored otherwise. Labels are what the frontend learns from."
+        f"{rule['unstable_max_error']:g} px, and ignored otherwise. A frontend can be trained on these labels."
     )
     names = ("stable", "unstable", "ignore", "withheld")
     rows = [(name, float(tracks[name]), f"{tracks[name]:,}") for name in names]

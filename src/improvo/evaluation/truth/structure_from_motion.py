@@ -6,6 +6,7 @@ Everything lies in a working folder, so that what was interrupted goes on: `imag
 
 from __future__ import annotations
 
+import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -28,6 +29,7 @@ from improvo.types import Float64, Int64
 
 MIN_TRACK = 3  # images that must see a point for its depth to count
 MAX_POINT_ERROR = 2.0  # pixels
+_FEATURE_BYTES = 350  # of a feature in the database, with its matches
 _CHUNK = 8  # images or pairs between two steps of the progress
 
 Progress = Callable[[str, int, int], None]  # stage, done, of how many
@@ -121,6 +123,7 @@ def reconstruct(
             "k1 k2 p1 p2; undistort the images first"
         )
     if not (folder / "model").is_dir():
+        _check_space(folder, len(sequence) * (start.width * start.height + _FEATURE_BYTES * settings.max_features))
         names = _write_images(sequence, folder, progress)
         with colmap_at(folder):
             _extract(pycolmap, folder, names, start, settings, threads, progress)
@@ -136,6 +139,15 @@ def reconstruct(
             best.write(str(unfinished))
         unfinished.rename(folder / "model")
     return read_reconstruction(folder / "model")
+
+
+def _check_space(folder: Path, needed: int) -> None:
+    """Refuse before any work what would not fit, since a full disk ends COLMAP and the process that it is part of."""
+    needed -= sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        sizes = f"needs about {needed / 1e6:.0f} MB, and {free / 1e6:.0f} MB are free"
+        raise OutputError(f"{folder}: {sizes}; free some space, or choose another folder")
 
 
 def read_reconstruction(folder: Path) -> Reconstruction:
