@@ -22,6 +22,7 @@ from improvo.frontend.weights import Weights, find_weights, load_weights, save_w
 from improvo.improvement.improve import Improvement, improve
 from improvo.improvement.recipe import TrainingJob
 from improvo.improvement.settings import ImproveSettings, SplitSettings, ValidationSettings
+from improvo.odometry.settings import OdometrySettings, StartSettings
 from improvo.stability.settings import LabelQualitySettings, LabelSettings
 
 _HELD = ImproveSettings().held
@@ -31,6 +32,7 @@ SETTINGS = ImproveSettings(
     frontend=FrontendSettings(SPOILED, max_keypoints=250),
     # a dozen frames of one wall, by a spoiled network, are no evidence that the odometry is right
     labels=LabelSettings(min_observations=6, quality=LabelQualitySettings(enabled=False)),
+    odometry=OdometrySettings(start=StartSettings(min_points=20)),  # the room is mostly one wall
     held=LABELS_TEACH,
     split=SplitSettings(0.3),
     validation=ValidationSettings(

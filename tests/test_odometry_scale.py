@@ -173,7 +173,7 @@ def test_the_command_writes_metres_everywhere(room: Path, tmp_path: Path, capsys
         (["depths"], "give depth | truth"),
         (["distance", "3", "9"], "give depth | truth"),
         (["distance", "3", "9", "far"], "not numbers"),
-        (["distance", "3", "3", "1"], "no two places"),
+        (["distance", "3", "3", "1"], "improvo: --scale distance: frames 3 and 3 are no two places"),
         (["distance", "3", "99", "1"], "frame 99 is not among those that are read"),
         (["height", "-1.5"], "is no length"),
         (["height", "0"], "is no length"),
@@ -197,7 +197,7 @@ def test_a_source_that_is_not_there_is_said_before_any_work(tmp_path: Path, caps
     for words, what in (
         (["depth"], "has no depth images"),
         (["truth"], "has no true poses"),
-        (["marker", "0.16"], "no marker was seen"),
+        (["marker", "0.16"], "no marker was seen in at least 3 of 5 frames"),
     ):
         assert main(["run", str(walk), "-o", str(tmp_path / "out"), "--scale", *words, "--quiet"]) == 2
         assert what in capsys.readouterr().err
@@ -263,8 +263,11 @@ def test_several_distances_are_averaged_and_contradictions_are_named(finished: t
     assert several.relative_error is not None
     assert several.relative_error < 0.02
     wrong = (*true[:2], (15, 35, 1.5 * true[2][2]))
-    with pytest.raises(InputError, match=r"frames \d+ and \d+ give .* m a unit, frames 15 and 35 give .* apart"):
+    with pytest.raises(InputError, match=r"frames \d+ and \d+ give .* m a unit, frames 15 and 35 give .* % apart"):
         scale_from_distance(tracked, ScaleSettings("distance", distances=wrong))
+    far_off = (true[0], (15, 35, 30 * true[2][2]))
+    with pytest.raises(InputError, match=r"frames 15 and 35 give .*, a factor of [23]\d\S* apart; measure again"):
+        scale_from_distance(tracked, ScaleSettings("distance", distances=far_off))
 
 
 def write_gps(path: Path, sequence: Sequence, every: int, began: float) -> None:

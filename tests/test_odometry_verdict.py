@@ -56,6 +56,10 @@ def test_each_kind_of_evidence_can_make_a_segment_doubtful() -> None:
     assert judge(GOOD, SETTINGS, (), ("two motions",)).word == RIGHT
     worse = replace(GOOD, error_percent=np.full(6, 1.2))
     assert (judge(worse, SETTINGS).word, judge(worse, SETTINGS, (), ("two motions",)).word) == (RIGHT, DOUBTFUL)
+    assert judge(worse, SETTINGS, (), ("two maps were contradicted",), 2).word == DOUBTFUL
+    slightly = replace(GOOD, error_percent=np.full(6, 0.7))
+    words = [judge(slightly, SETTINGS, (), ("contradicted",), halvings).word for halvings in (1, 2)]
+    assert words == [RIGHT, DOUBTFUL]
     assert judge(None, SETTINGS).word == NOT_JUDGED
     assert judge(None, SETTINGS, ("two motions",)).word == DOUBTFUL
 
@@ -80,6 +84,16 @@ def test_a_lens_that_is_another_or_changes_is_an_alarm_where_it_is_known_well() 
         assert "the focal length" in changed(lens=(same, other)).evidence[0]
     unsure = replace(same, offset=0.25, offset_error=0.1, growth=0.3, growth_error=0.1)
     assert changed(lens=(same, unsure)).word == RIGHT
+
+
+def test_one_window_of_hundreds_is_no_alarm_but_is_told() -> None:
+    same = LensMeasure((0, 40), 0.01, 0.01, 0.02, 0.01)
+    other = replace(same, growth=-0.2)
+    assert changed(lens=(*[same] * 98, other)).word == DOUBTFUL
+    verdict = changed(lens=(*[same] * 300, other))
+    assert verdict.word == RIGHT
+    assert "the focal length changes" in verdict.evidence[-1]
+    assert changed(lens=(*[same] * 300, *[other] * 9)).word == DOUBTFUL
 
 
 def window(growth: float, offset: float) -> EvidenceWindow:

@@ -7,6 +7,7 @@ import re
 import shutil
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -217,7 +218,12 @@ def test_what_is_wrong_is_said_in_plain_words() -> None:
     assert "2 segments" in words(report(segments=[{"first": 0}, {"first": 6}]))
     verdict = {"word": "doubtful", "evidence": ["the parts disagree"], "uncertain": [], "error_percent": 8.0}
     doubted = {"number": 0, "first": 0, "last": 9, "verdict": verdict}
-    assert "Segment 0 (frames 0 to 9) is doubtful: the parts disagree." in words(report(segments=[doubted]))
+    said = words(report(segments=[doubted]))
+    assert "Segment 0 (frames 0 to 9) is doubtful: the parts disagree." in said
+    assert "makes no labels" in said
+    assert "zoomed" not in said
+    zoomed = {**doubted, "verdict": {**verdict, "evidence": ["the focal length changes"]}}
+    assert "zoomed" in words(report(segments=[zoomed]))
     assert "Check the calibration" in words(report(), error=2.5)
     skipped = [{"index": 3, "source": "a.png", "reason": "truncated"}]
     assert "a.png: truncated" in words(report(input={"skipped": skipped, "notes": []}))
@@ -313,4 +319,10 @@ def test_improvement_is_told_with_its_setbacks(tmp_path: Path) -> None:
     assert pair.index("before: matches") < pair.index("round 2: matches") < pair.index("</div>")
     assert "&lt;one&gt;" in text
     write_improvement_page(tmp_path / "none.html", "Improvement", "", measures, rounds, best=0)
-    assert "round 2, not kept: matches" in (tmp_path / "none.html").read_text()
+    none = (tmp_path / "none.html").read_text()
+    assert "round 2, not kept: matches" in none
+    assert "Nothing: the weights are those at the start." in none
+    assert "<h2>Labels" in none
+    unlabelled = [replace(entry, labels={}) for entry in rounds]
+    write_improvement_page(tmp_path / "held.html", "Improvement", "", measures, unlabelled)
+    assert "<h2>Labels" not in (tmp_path / "held.html").read_text()

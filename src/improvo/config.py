@@ -138,7 +138,8 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings", bas
     try:
         return _converter().structure(values, cls)
     except ClassValidationError as error:
-        raise ConfigError(f"{where}: {_first_reason(error)}") from None
+        first = _first_reason(error)
+        raise ConfigError(first if first.startswith("--") else f"{where}: {first}") from None
     except (TypeError, ValueError, OverflowError, AttributeError, LookupError) as error:
         raise ConfigError(f"{where}: {reason(error)}") from None
 
@@ -245,5 +246,5 @@ def _first_reason(error: Any) -> str:
         error = error.exceptions[0]
         path += [str(note).rsplit(" ", 1)[-1] for note in getattr(error, "__notes__", []) if "attribute" in note]
     where = ".".join(path)
-    named = not path or f"`{where}." in str(error) or f"`{where}`" in str(error)
+    named = not path or f"`{where}." in str(error) or f"`{where}`" in str(error) or str(error).startswith("--")
     return str(error) if named else f"setting `{where}`: {error}"

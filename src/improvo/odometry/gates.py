@@ -8,7 +8,7 @@ that a segment may have (`verdict.max_error`).
 
 from __future__ import annotations
 
-FEWEST = 12  # right points fix a pose; fewer agree by chance
+FEWEST = 12  # right points fix a pose, a scale or a lens; fewer agree by chance
 LARGE_PART = 0.4  # of the matches, the picture or the keypoints: what is smaller may be a mover, or repeated texture
 FAR = 3.0  # times the tolerance: a match so far off a motion is none of its noise, and one that moved so far did move
 SAME_TURN_DEG = 5.0  # between two rotations that are to be one

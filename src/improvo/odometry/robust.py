@@ -24,9 +24,9 @@ from improvo.odometry.view import Mask, View
 from improvo.types import Float64
 
 _CARRIED = 0.2  # share of the observations that turned out to move with the camera; with more the map is wrong
-_FIRST_COOLDOWN, _MAX_COOLDOWN = 3, 30  # frames after a costly failure to start; they double with each further one
 _MAX_BUFFERED = 300  # frames in the initialisation buffer; the oldest leaves it without a pose
 _LOST = "lost"  # why a segment ended
+_TWO_VIEWS = "two-view geometry"  # what contradicted it
 
 
 class RobustMapper(Mapper):
@@ -47,6 +47,7 @@ class RobustMapper(Mapper):
         self._costly_failures = 0  # since the last map
         self._worlds = 0  # maps started
         self._lens = LensWatch(camera, settings.tolerance, settings.seed)
+        self._contradicted = 0  # maps in a row by two-view geometry, each over frames of the one before
         self._carried = False  # a large part of the map has turned out to move with the camera
         self._window = SlidingWindow(settings.window, camera.width)
         self._health = HealthCheck(camera, settings, descriptor_distance)
@@ -93,7 +94,7 @@ class RobustMapper(Mapper):
             self._start_anew(view, "what moves with the camera")
             return
         if self._health.contradicts(view, {earlier.frame_index: earlier for earlier in self._map.history}):
-            self._start_anew(view, "two-view geometry")
+            self._start_anew(view, _TWO_VIEWS)
             return
         if self._health.ambiguous:
             self._events.two_motions(view.frame_index)
@@ -131,7 +132,7 @@ class RobustMapper(Mapper):
         if isinstance(started, InitFailure):
             self._events.initialisation_failed(view.frame_index, started.reason)
             if started.costly:
-                self._cooldown = min(_FIRST_COOLDOWN * 2**self._costly_failures, _MAX_COOLDOWN)
+                self._cooldown = min(2**self._costly_failures, self._settings.window.recent)
                 self._costly_failures += 1
             return
         self._map = started
@@ -141,6 +142,9 @@ class RobustMapper(Mapper):
         if self._lens.factor != 1.0:
             self._events.focal_length(self._buffer[0].frame_index, self._lens.factor, "the segment is doubtful")
             self._judge.alarm(f"the focal length is about {self._lens.factor:.2f} times that of the camera as given")
+        if self._contradicted:
+            maps = "a former map" if self._contradicted == 1 else f"each of {self._contradicted} former maps"
+            self._judge.suspicion(f"{maps} of these frames was contradicted by {_TWO_VIEWS}", self._contradicted)
         self._result.begin_segment()
         self._result.give_up(each for each in self._buffer if each.cam_from_world is None)
         self._health = HealthCheck(self._camera, self._settings, self._descriptor_distance)
@@ -202,6 +206,7 @@ class RobustMapper(Mapper):
 
     def _start_anew(self, view: View, by: str) -> None:
         """The map is wrong: a provisional one starts anew over all its frames, another one over its last frames."""
+        contradicted = self._contradicted + (by == _TWO_VIEWS)
         if self._states.is_provisional:
             self._events.contradicted(view.frame_index, "the map is started anew", by)
             self._buffer = self._provisional
@@ -212,6 +217,7 @@ class RobustMapper(Mapper):
             doubtful, self._window.recent = self._window.recent, []
             self._end_segment(f"contradicted by {by}")
             self._buffer = doubtful
+        self._contradicted = contradicted
         for each in self._buffer:
             each.forget_pose()
         self._try_to_start(view)
@@ -255,6 +261,7 @@ class RobustMapper(Mapper):
         segment = self._result.end_segment(xyz, reason, self._judge.verdict(xyz))
         if segment is not None:
             self._events.judged(segment)
+        self._contradicted = 0
         self._clear()
         self._states.map_ended()
 

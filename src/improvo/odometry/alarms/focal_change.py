@@ -14,14 +14,12 @@ import numpy as np
 
 from improvo.geometry.camera import Camera
 from improvo.geometry.ransac import Ransac, absolute_pose
+from improvo.odometry.gates import FEWEST
 from improvo.odometry.view import View, common_tracks
 from improvo.types import Float64
 
-_LEAST = np.log(1.08)  # change of the distances in one frame; a step ahead rarely changes them by more
-_MIN_POINTS = 20  # of the map, in both views
-_BETTER = 1.25  # times as many points must fit with the other focal length,
-_MORE = 8  # and so many more
-_SAME_LENS = 0.05  # relative difference from the camera as given that is none
+_SAME_LENS = np.log(1.08)  # change of the focal length that is none; a step ahead rarely changes distances by more
+_BETTER = 1.25  # times as many points must fit with the other focal length
 
 
 class LensWatch:
@@ -51,7 +49,7 @@ class LensWatch:
         if change == 1.0:
             return False
         self.factor *= change
-        if abs(self.factor - 1.0) < _SAME_LENS:
+        if abs(np.log(self.factor)) < _SAME_LENS:
             self.factor = 1.0
         return True
 
@@ -70,16 +68,16 @@ def focal_change(before: View, view: View, xyz: Float64, camera: Camera, toleran
     rows, rows_before = common_tracks(view, before)
     known = before.points[rows_before] >= 0
     rows, rows_before = rows[known], rows_before[known]
-    if len(rows) < _MIN_POINTS:
+    if len(rows) < 2 * FEWEST:
         return 1.0
     factor = _scale(before.keypoints[rows_before], view.keypoints[rows])
-    if abs(np.log(factor)) < _LEAST:
+    if abs(np.log(factor)) < _SAME_LENS:
         return 1.0
     points, pixels = xyz[before.points[rows_before]], view.keypoints[rows]
     ransac = Ransac(tolerance, seed, min_iterations=100, max_iterations=1000)
     zoomed = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
     as_given, changed = (int(absolute_pose(points, pixels, each, ransac).inliers.sum()) for each in (camera, zoomed))
-    return factor if changed >= max(_BETTER * as_given, as_given + _MORE) else 1.0
+    return factor if changed >= max(_BETTER * as_given, as_given + FEWEST) else 1.0
 
 
 def _scale(before: Float64, now: Float64) -> float:

@@ -26,7 +26,6 @@ from improvo.types import Int64
 
 _GAPS = (3, 6, 12)  # frames between the two views of a check
 _ROUNDS = 3  # consecutive checks that are evaluated together
-_MIN_EVIDENCE = 100  # inliers in all of them; fewer decide nothing
 _AGREEMENT = 0.85  # share of the two views' own inliers that fit the map: right maps stay over 0.90, wrong under 0.80
 
 
@@ -86,7 +85,7 @@ class HealthCheck:
         if len(self._rounds) < _ROUNDS:
             return False
         map_inliers, own_inliers = np.sum(self._rounds, axis=(0, 1))
-        decides = own_inliers >= _MIN_EVIDENCE
+        decides = own_inliers >= _ROUNDS * self._settings.start.min_points
         return bool(decides and map_inliers < _AGREEMENT * own_inliers)
 
     @property

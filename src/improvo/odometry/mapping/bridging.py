@@ -12,13 +12,12 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.alignment import Similarity
-from improvo.odometry.gates import SAME_SCALE
+from improvo.odometry.gates import SAME_SCALE, SAME_TURN_DEG
 from improvo.odometry.mapping.former_map import FormerMap, Sighting
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
 from improvo.types import Float64
 
-_LARGEST_ANGLE_DEG = 3.0  # between the turns of a camera by two sightings
 _FORMER_MAPS = 2  # kept; the camera seldom returns to an older place within so few frames
 
 
@@ -89,7 +88,7 @@ def _joined(former: FormerMap, a: Sighting, b: Sighting, max_error: float) -> Jo
         return None
     angle = se3.rotation_angle_deg(a.former_from_new.rotation.T @ b.former_from_new.rotation)
     distance = np.linalg.norm(a.former_from_new.apply(b.center) - b.former_pose[:3, 3])
-    if float(angle) > _LARGEST_ANGLE_DEG or distance > max_error * b.depth:
+    if float(angle) > SAME_TURN_DEG or distance > max_error * b.depth:
         return None
     log_scale = float(np.average(logs, weights=errors**-2.0))
     better = a if a.inliers >= b.inliers else b

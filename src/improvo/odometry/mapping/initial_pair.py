@@ -19,10 +19,9 @@ from improvo.types import Float64, Int64
 
 _STRICT = 2.0 / 3.0  # of the tolerance, since two views have nothing else to be right by
 _MIN_INLIER_SHARE = 0.3  # essential inliers of the matches
-_MAX_HOMOGRAPHY_RATIO = 0.7  # homography inliers over essential inliers; more is too little parallax, unless
-# twice min_points of the essential inliers are no homography inliers, or
-_PLANE_RATIO = 0.8  # the ratio is at least this: then the scene is one plane, and its homography is used
-_UNIQUE_SHARE = 0.75  # a second motion over a plane with more of the first one's points leaves the choice open
+# Homography inliers over essential inliers: with more the scene is one plane, unless twice min_points are off it. And
+# points of a second motion over a plane, over those of the first: with more the choice between them is open.
+_MOSTLY = 0.75
 _MAX_SECOND_MOTION = 0.5  # spread over the picture of another motion, as a share of the first one's
 
 
@@ -80,9 +79,7 @@ def initial_pair(
         return InitFailure("two motions: one of them is not the camera's")
     ratio = plane.inliers.sum() / max(inliers.sum(), 1)
     off_plane = (inliers & ~plane.inliers).sum()
-    if ratio > _MAX_HOMOGRAPHY_RATIO and off_plane < 2 * least:
-        if ratio < _PLANE_RATIO:
-            return InitFailure("too little parallax")
+    if ratio > _MOSTLY and off_plane < 2 * least:
         return _from_plane(a, b, rows_a, rows_b, plane, camera, settings)
     return _with_points(a, b, rows_a[inliers], rows_b[inliers], essential.pose, camera, settings)
 
@@ -114,6 +111,6 @@ def _from_plane(
     pairs = sorted((pair for pair in tried if isinstance(pair, InitialPair)), key=lambda pair: -len(pair.rows_a))
     if not pairs:
         return InitFailure("too little parallax")
-    if len(pairs) > 1 and len(pairs[1].rows_a) > _UNIQUE_SHARE * len(pairs[0].rows_a):
+    if len(pairs) > 1 and len(pairs[1].rows_a) > _MOSTLY * len(pairs[0].rows_a):
         return InitFailure("a plane with two possible motions")
     return pairs[0]

@@ -16,8 +16,6 @@ from improvo.odometry.mapping.window import OBJECTIVE, SOLVER, adjust
 from improvo.odometry.settings import OdometrySettings, WindowSettings
 from improvo.odometry.view import View, common_tracks
 
-_MAX_MEAN_ERROR = 1.2  # pixels, after adjustment and pruning
-_MAX_LOST = 4  # buffered frames in a row, such as black ones, that may stay without a pose
 _PATIENT = SolverSettings(max_iterations=30, relative_decrease=1e-4)  # of the first pair, and of all views at the end
 
 
@@ -73,7 +71,7 @@ def _grow(
     a.cam_from_world, b.cam_from_world = np.eye(4), pair.b_from_a
     a.points[pair.rows_a], b.points[pair.rows_b] = ids, ids
     report = adjust([b], [a], store, K, OBJECTIVE, _PATIENT, max_error)
-    if report.mean_error > _MAX_MEAN_ERROR or report.kept < 2 * settings.start.min_points:
+    if report.mean_error > settings.tolerance or report.kept < 2 * settings.start.min_points:
         return InitFailure("the first two views do not fit")
     local_map.refiner.refine([(a, a.observed), (b, b.observed)], store)
     local_map.remember(a)
@@ -85,7 +83,7 @@ def _grow(
             local_map.localise(view, neighbour)
             if view.cam_from_world is None:
                 missed += 1
-                if missed <= _MAX_LOST:
+                if missed <= settings.loss.max_lost_frames:
                     continue
                 if view.frame_index > a.frame_index:
                     return InitFailure("the first views do not fit together", costly=True)
@@ -100,7 +98,7 @@ def _grow(
         neighbour = view
     first, *rest = sorted(done, key=lambda view: view.frame_index)
     report = adjust(rest, [first], store, K, OBJECTIVE, _PATIENT, max_error)
-    if not report.mean_error <= _MAX_MEAN_ERROR:
+    if not report.mean_error <= settings.tolerance:
         return InitFailure("the first views do not fit together", costly=True)
     return None
 

@@ -32,8 +32,6 @@ PARTS = (*QUARTERS, *HALVES)
 _WINDOW = 12  # keyframes that are adjusted together from each part of the evidence; half of them overlap
 _FEW = 8  # observations or common points; fewer determine nothing
 _THIN = 6  # points seen on both sides of a gap between two keyframes; fewer carry no scale across it
-_LENS_KEYFRAMES = 8  # of a window that may say something of the focal length
-_UNDETERMINED = 1.1 * SAME_SCALE  # change of the logarithm of the scale that then counts, at least: enough for a mark
 _HASH = 2654435761  # a multiplier of Knuth's, so that the halves of the points are no halves of time or place
 
 
@@ -159,11 +157,11 @@ class EvidenceCheck:
             steps[part] = _continue(path, self._solved(window, mask), window, self._overlap)
         thin = window.fewest_across() < _THIN
         if thin:
-            steps = np.maximum(np.abs(steps), _UNDETERMINED)
+            steps = np.maximum(np.abs(steps), SAME_SCALE)
         if self._overlap or thin:
             self._scale_steps.append(steps)
             self._links.append(frames)
-        if self._lens_due and len(keyframes) >= _LENS_KEYFRAMES:
+        if self._lens_due and len(keyframes) >= _FEW:
             self._lens.append(measured_lens(window, frames, self._camera))
         self._lens_due = not self._lens_due
         self._overlap = min(_WINDOW // 2, len(keyframes))

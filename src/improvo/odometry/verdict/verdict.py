@@ -20,6 +20,7 @@ _FOCAL_CHANGE = 0.12  # of the logarithm of the focal length, within a window or
 _FOCAL_ERROR = 0.2  # of the logarithm of the focal length, from that of the camera as given
 _SIGMAS = 5.0  # standard errors that a deviation of the focal length must exceed
 _SIGMAS_OF_GROWTH = 8.0  # its change within a window, which a step ahead imitates; 6.7 at most in right recordings
+_RARE = 0.01  # share of windows that say so in right recordings; one of the hundreds of a long one is no alarm
 _LARGEST_LENS_ERROR = 0.06  # of the logarithm of a focal length; a window that knows it less well says nothing of it
 RIGHT, DOUBTFUL, NOT_JUDGED = "right", "doubtful", "not judged"
 
@@ -58,6 +59,7 @@ def judge(
     settings: VerdictSettings,
     alarms: tuple[str, ...] = (),
     suspicions: tuple[str, ...] = (),
+    halvings: int = 1,
 ) -> Verdict:
     """The verdict of a segment by the spread of its path, and by what else was seen.
 
@@ -65,16 +67,20 @@ def judge(
         spread: of the paths from the parts of the evidence; None where the segment is too short for one.
         settings: the limits.
         alarms: in plain words; each makes the segment doubtful.
-        suspicions: in plain words; where there is one, half of the largest error is enough.
+        suspicions: in plain words; where there is one, a smaller error is enough for a doubt,
+        halvings: by half each.
     """
     if spread is None:
         return Verdict(DOUBTFUL if alarms else NOT_JUDGED, evidence=(*alarms, "too few keyframes to judge the path"))
-    alarms = (*alarms, *_lens_alarms(spread))
+    of_lens = _said_of_lens(spread)
+    if len(of_lens) > _RARE * len(spread.lens):
+        alarms = (*alarms, of_lens[0])
     error = estimated_error(spread)
     uncertain = _uncertain(spread)
     evidence = [*alarms, *suspicions, _in_words(spread, error)]
+    evidence += [words for words in of_lens[:1] if words not in alarms]
     evidence += [f"frames {first} to {last}: the scale is not determined" for first, last in uncertain]
-    limit = 0.5 * settings.max_error if suspicions else settings.max_error
+    limit = settings.max_error * 0.5 ** (halvings if suspicions else 0)
     word = RIGHT if error <= limit and not alarms else DOUBTFUL
     return Verdict(word, error, spread.noise_px, tuple(evidence), uncertain)
 
@@ -117,27 +123,27 @@ def _scale_errors(spread: Spread) -> Float64:
     return np.asarray(np.median(np.abs(spread.scale_steps), axis=1), np.float64)
 
 
-def _lens_alarms(spread: Spread) -> tuple[str, ...]:
-    """What contradicts that one lens, the camera's, looked at one world that stands still; most telling first.
+def _said_of_lens(spread: Spread) -> tuple[str, ...]:
+    """What windows say against that one lens, the camera's, looked at one world that stands still; most telling first.
 
     A focal length that is not the camera's can be a zoom or a wrong calibration. Where something large moves, too, its
     motion and the camera's fit together only with a focal length that is wrong and changes.
     """
-    alarms: list[str] = []
+    said: list[str] = []
     sure = [each for each in spread.lens if each.offset_error < _LARGEST_LENS_ERROR]
     for each in spread.lens:
         first, last = each.frames
         if abs(each.growth) > max(_FOCAL_CHANGE, _SIGMAS_OF_GROWTH * each.growth_error):
-            alarms.append(_told(first, last, f"changes by {100 * abs(np.expm1(each.growth)):.0f} %"))
+            said.append(_told(first, last, f"changes by {100 * abs(np.expm1(each.growth)):.0f} %"))
     for each in sure:
         first, last = each.frames
         if abs(each.offset) > max(_FOCAL_ERROR, _SIGMAS * each.offset_error):
-            alarms.append(_told(first, last, f"is {np.exp(each.offset):.2f} times that of the camera as given"))
+            said.append(_told(first, last, f"is {np.exp(each.offset):.2f} times that of the camera as given"))
     for a, b in pairwise(sure):
         change = b.offset - a.offset
         if abs(change) > max(_FOCAL_CHANGE, _SIGMAS * float(np.hypot(a.offset_error, b.offset_error))):
-            alarms.append(_told(a.frames[0], b.frames[1], f"changes by {100 * abs(np.expm1(change)):.0f} %"))
-    return tuple(alarms[:1])
+            said.append(_told(a.frames[0], b.frames[1], f"changes by {100 * abs(np.expm1(change)):.0f} %"))
+    return tuple(said)
 
 
 def _told(first: int, last: int, words: str) -> str:
@@ -147,7 +153,7 @@ def _told(first: int, last: int, words: str) -> str:
 def _uncertain(spread: Spread) -> tuple[tuple[int, int], ...]:
     """Stretches (first and last frame) across which the parts of the evidence disagree about the scale."""
     found: list[tuple[int, int]] = []
-    for first, last in spread.link_frames[_scale_errors(spread) > SAME_SCALE].tolist():
+    for first, last in spread.link_frames[_scale_errors(spread) >= SAME_SCALE].tolist():
         if found and first <= found[-1][1]:
             found[-1] = (found[-1][0], last)
         else:
