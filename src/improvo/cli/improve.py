@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_setting(group, defaults, "--minutes", "minutes")
     add_setting(group, defaults, "--control", "control")
     for flag, text in (
-        ("--steps", "of training (default: 2 for each frame, 300 to 1200 in all; 1000 with the recipe tracks)"),
+        ("--steps", "of training (default: 1 for each frame, 300 to 1200 in all; 1000 with the recipe tracks)"),
         ("--batch-size", "pairs of images a step (default: 2; 8 smaller ones with the recipe tracks)"),
     ):
         group.add_argument(flag, type=int, default=argparse.SUPPRESS, metavar="N", help=text)
