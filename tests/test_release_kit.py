@@ -79,6 +79,13 @@ def test_forms_and_workflows_are_well_formed(path: Path) -> None:
         assert all(part["type"] in ("textarea", "input", "markdown") for part in content["body"])
 
 
+@pytest.mark.parametrize("path", sorted((ROOT / ".github" / "workflows").iterdir()), ids=lambda path: path.name)
+def test_actions_are_pinned_by_their_commit(path: Path) -> None:
+    used = re.findall(r"uses: *(.+)", path.read_text())
+    assert len(used) > 1
+    assert [each for each in used if not re.fullmatch(r"[\w/-]+@[0-9a-f]{40}  # v\d+(\.\d+)+", each)] == []
+
+
 @pytest.mark.parametrize(
     ("licence", "verdict"),
     [

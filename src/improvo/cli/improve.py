@@ -1,4 +1,4 @@
-"""Self-improvement: label video with a network, train it with the labels, keep it if it got better on other video.
+"""Self-improvement: train a network on video by its own odometry, keep it if it got better on video it never saw.
 
 Leaves OUT/weights.safetensors, the best of all rounds and of the start, and OUT/report.html. Part of the video is held
 out and never trained on; run again to continue a run that was stopped, or with a higher --rounds.
