@@ -42,7 +42,8 @@ $(VENV)/.dev-installed: $(VENV)/bin/python pyproject.toml
 	touch $@ $(VENV)/.run-installed
 
 $(VENV)/.cluster-installed: $(VENV)/.dev-installed
-	$(BIN)/pip install --quiet -e '.[ray,remote]' 'moto[server]>=5'
+	# the extra boto3: S3's client wants an older one than moto would take, which pip does not find out in time
+	$(BIN)/pip install --quiet -e '.[ray,remote]' 'aiobotocore[boto3]' 'moto[server]>=5'
 	touch $@
 
 # The versions that requirements-dev.txt names, by their hashes; `make locked test` tests with them. To renew the file:

@@ -10,9 +10,10 @@ recording and on the bundled room, 320 pixels wide. Seeds decide what is drawn, 
 the other.
 
 A frame is right if its segment's error is under 3 % of the segment's own path and the turn over a second is under 2°
-off. A silent error is a segment of at least 20 frames that is over 5 % wrong (or has a path where there was none) and
-claims to be right. A false alarm is a segment that was ended, started anew or doubted though it was right. A frame
-could be tracked if any of the frontends has it right. A run with poses for pictures that show nothing is SILENT, too.
+off. A silent error is a segment of at least 20 frames that is over 5 % wrong, turns otherwise in over half of its
+frames, or has a path where there was none, and claims to be right. A false alarm is a segment that was ended, started
+anew or doubted though its error was under 3 % and nine tenths of its frames turned as they should. A frame could be
+tracked if any of the frontends has it right. A run with poses for pictures that show nothing is SILENT, too.
 """
 
 from __future__ import annotations

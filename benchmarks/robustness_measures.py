@@ -13,17 +13,19 @@ from improvo.evaluation.trajectory.protocol import align, clean_truth
 from improvo.frontend import Frontend
 from improvo.geometry.se3 import rotation_angle_deg
 from improvo.odometry.events import Event
+from improvo.odometry.gates import STEP_FRAMES
 from improvo.odometry.segments import Segment
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import TrackingState
 from improvo.odometry.verdict.verdict import RIGHT as RIGHT_WORD
 from improvo.odometry.visual_odometry import VisualOdometry
-from improvo.types import Float64, Frame, Trajectory
+from improvo.types import Float64, Frame, Mask, Trajectory
 from robustness_clips import Clip
 
 RIGHT_PERCENT = 3.0  # of the segment's own path
 WRONG_PERCENT = 5.0
 RIGHT_ROTATION_DEG = 2.0  # over a second
+RIGHT_TURNS, WRONG_TURNS = 0.1, 0.5  # share of a segment's frames that turn otherwise, of a right and of a wrong one
 MIN_FRAMES = 20  # of a segment, for it to count
 MIN_PATH = 0.02  # metres; without a path, an error has no share of it
 DOUBTS = ("focal length",)  # events that say that the segment may be wrong
@@ -40,6 +42,7 @@ class JudgedSegment:
     frames: int
     path_m: float  # true
     error_percent: float | None  # ATE after Sim3 over the path; None where there is no path or no truth
+    turned_wrong: float  # share of its frames whose turn over a second is wrong
     reason: str
     doubt: str  # what the run itself says against it; empty where it claims to be right
     estimated_error_percent: float | None  # by its verdict
@@ -51,14 +54,19 @@ class JudgedSegment:
         return self.frames >= MIN_FRAMES
 
     @property
-    def right(self) -> bool:
-        """Whether its error is small."""
+    def near(self) -> bool:
+        """Whether its positions are right."""
         return self.error_percent is not None and self.error_percent < RIGHT_PERCENT
 
     @property
+    def right(self) -> bool:
+        """Whether positions and rotations are right: with another lens, only the positions may be."""
+        return self.near and self.turned_wrong <= RIGHT_TURNS
+
+    @property
     def wrong(self) -> bool:
-        """Whether its error is large, or it claims a path where there was none."""
-        return self.error_percent is None or self.error_percent > WRONG_PERCENT
+        """Whether its error is large, most of its turns are wrong, or it claims a path where there was none."""
+        return self.error_percent is None or self.error_percent > WRONG_PERCENT or self.turned_wrong > WRONG_TURNS
 
     @property
     def silent(self) -> bool:
@@ -116,27 +124,29 @@ def run_and_judge(clip: Clip, frontend: Frontend, seed: int) -> Judged:
     truth = clean_truth(Trajectory(clip.times, clip.world_from_cam))[0]
     odometry = VisualOdometry(frontend, clip.camera, OdometrySettings(seed=seed))
     restarts = []
-    interval = OdometrySettings().health.interval
     before: Trajectory | None = None
     for number, (time, image) in enumerate(zip(clip.times.tolist(), clip.images, strict=True)):
         known = len(odometry.events)
-        if odometry.state is TrackingState.PROVISIONAL and number % interval == 0:
+        if odometry.state is TrackingState.PROVISIONAL and number % STEP_FRAMES == 0:
             before = odometry.trajectory  # a check may start it anew
         odometry.track(Frame(number, time, image, f"picture {number}"))
         for event in odometry.events[known:]:
             if event.kind == "contradiction" and "anew" in event.detail and before is not None:
                 running = int(before.segment.max())
                 error = _error_percent(before, truth, running)[1]
-                restarts.append(Alarm(number, event.detail, error, error is not None and error < RIGHT_PERCENT))
+                turned = _share(_rotation_wrong(before, truth), before, running)
+                right = error is not None and error < RIGHT_PERCENT and turned <= RIGHT_TURNS
+                restarts.append(Alarm(number, event.detail, error, right))
     odometry.finish()
     estimate = odometry.trajectory
-    segments = [_judged(segment, estimate, truth, odometry.events) for segment in odometry.segments]
+    rotation_wrong = _rotation_wrong(estimate, truth)
+    segments = [_judged(segment, estimate, truth, rotation_wrong, odometry.events) for segment in odometry.segments]
     alarms = restarts + [
         Alarm(each.last, each.doubt, each.error_percent, each.right)
         for each in segments
         if each.doubt and not each.doubt.startswith("not judged")  # which is neither a claim nor an alarm
     ]
-    return Judged(_frames(clip, estimate, truth, segments), segments, alarms, list(odometry.events))
+    return Judged(_frames(clip, estimate, rotation_wrong, segments), segments, alarms, list(odometry.events))
 
 
 def doubt(segment: Segment, events: Sequence[Event]) -> str:
@@ -155,7 +165,9 @@ def _number(value: float) -> float | None:
     return round(float(value), 4) if np.isfinite(value) else None
 
 
-def _judged(segment: Segment, estimate: Trajectory, truth: Trajectory, events: Sequence[Event]) -> JudgedSegment:
+def _judged(
+    segment: Segment, estimate: Trajectory, truth: Trajectory, rotation_wrong: Mask, events: Sequence[Event]
+) -> JudgedSegment:
     path, error = _error_percent(estimate, truth, segment.number)
     return JudgedSegment(
         segment.number,
@@ -164,6 +176,7 @@ def _judged(segment: Segment, estimate: Trajectory, truth: Trajectory, events: S
         segment.frames,
         path,
         error,
+        round(_share(rotation_wrong, estimate, segment.number), 3),
         segment.reason,
         doubt(segment, events),
         _number(segment.verdict.error_percent),
@@ -186,10 +199,15 @@ def _error_percent(estimate: Trajectory, truth: Trajectory, number: int) -> tupl
     return path, 100.0 * float(np.sqrt((distance**2).mean())) / path
 
 
-def _frames(clip: Clip, estimate: Trajectory, truth: Trajectory, segments: list[JudgedSegment]) -> str:
+def _share(rotation_wrong: Mask, estimate: Trajectory, number: int) -> float:
+    """Of a segment's frames with a pose, those whose turn is wrong."""
+    own = estimate.valid & (estimate.segment == number)
+    return float(rotation_wrong[own].mean()) if own.any() else 0.0
+
+
+def _frames(clip: Clip, estimate: Trajectory, rotation_wrong: Mask, segments: list[JudgedSegment]) -> str:
     """A letter for each frame."""
-    rotation_wrong = _rotation_wrong(estimate, truth)
-    right_segments = {segment.number for segment in segments if segment.right}
+    right_segments = {segment.number for segment in segments if segment.near}
     letters = []
     for row, has_pose in enumerate(estimate.valid.tolist()):
         if not clip.trackable[row]:
@@ -202,7 +220,7 @@ def _frames(clip: Clip, estimate: Trajectory, truth: Trajectory, segments: list[
     return "".join(letters)
 
 
-def _rotation_wrong(estimate: Trajectory, truth: Trajectory) -> Any:
+def _rotation_wrong(estimate: Trajectory, truth: Trajectory) -> Mask:
     """(N,) frames whose turn within the second that begins with them, or ends, differs from the true one."""
     wrong_from, wrong_to = np.zeros(len(estimate), bool), np.zeros(len(estimate), bool)
     judged_from, judged_to = wrong_from.copy(), wrong_to.copy()

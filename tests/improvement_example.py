@@ -32,7 +32,7 @@ SETTINGS = ImproveSettings(
     frontend=FrontendSettings(SPOILED, max_keypoints=250),
     # a dozen frames of one wall, by a spoiled network, are no evidence that the odometry is right
     labels=LabelSettings(min_observations=6, quality=LabelQualitySettings(enabled=False)),
-    odometry=OdometrySettings(start=StartSettings(max_homography_ratio=0.9)),  # the room is mostly one wall
+    odometry=OdometrySettings(start=StartSettings(min_points=20)),  # the room is mostly one wall
     held=LABELS_TEACH,
     split=SplitSettings(0.3),
     validation=ValidationSettings(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import subprocess
 import sys
@@ -15,20 +16,26 @@ from rendered_walk import write_walk
 
 from fuzz_targets import targets
 from improvo.cli.main import main
+from improvo.errors import installed
 
 
 @pytest.mark.parametrize(
-    "error",
+    ("error", "says"),
     [
-        MemoryError(),
-        MemoryError("Unable to allocate 9 GiB for an array"),
-        cv2.error("OpenCV(5.0.0) alloc.cpp:73: error: (-4:Insufficient memory) Failed to allocate 9 bytes"),
-        RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: can't allocate memory"),
-        RuntimeError("can't start new thread"),
+        (MemoryError(), "out of memory; "),
+        (MemoryError("Unable to allocate 9 GiB for an array"), "out of memory; "),
+        (
+            cv2.error("OpenCV(5.0.0) alloc.cpp:73: error: (-4:Insufficient memory) Failed to allocate"),
+            "out of memory; ",
+        ),
+        (RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: can't allocate memory"), "out of memory; "),
+        (RuntimeError("can't start new thread"), "out of memory; "),
+        (OSError(errno.ENOSPC, "No space left on device", "/dev/shm/x"), "no space is left on the disk; "),
+        (OSError(errno.EFBIG, "File too large"), "no space is left on the disk; "),
     ],
 )
-def test_out_of_memory_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception
+def test_what_the_machine_lacks_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception, says: str
 ) -> None:
     def fail(*arguments: object, **options: object) -> None:
         raise error
@@ -37,7 +44,7 @@ def test_out_of_memory_is_one_line(
     assert main(["info", str(write_walk(tmp_path / "walk", frames=2))]) == 2
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 1
-    assert said[0].startswith("improvo: out of memory; ")
+    assert said[0].startswith(f"improvo: {says}")
 
 
 def test_an_error_of_ours_stays_a_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,23 +111,36 @@ def test_results_that_name_pictures_elsewhere_are_refused(tmp_path: Path, capsys
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the size of files, as a full disk would")
-@pytest.mark.parametrize("room", [300, 6000, 15_000])
-def test_a_disk_that_is_full(tmp_path: Path, room: int) -> None:
+@pytest.mark.parametrize(
+    ("command", "needs", "room"),
+    [
+        ("run", "cv2", 300),
+        ("run", "cv2", 6000),
+        ("run", "cv2", 15_000),
+        ("export features --layout hloc --no-images", "h5py", 6000),
+        ("export features --layout colmap --no-images", "pycolmap", 6000),
+        ("export features --layout colmap --no-images", "pycolmap", 200_000),
+        ("simulate --frames 2 --size 96x64", "mujoco", 500),
+    ],
+)
+def test_a_disk_that_is_full(tmp_path: Path, command: str, needs: str, room: int) -> None:
+    if not installed(needs):
+        pytest.skip(f"needs {needs}")
     walk = write_walk(tmp_path / "walk", frames=12)
+    recording = [] if command.startswith("simulate") else [str(walk), "--frontend", "orb", "--max-keypoints", "400"]
     out = tmp_path / "out"
     program = f"""
 import resource, sys
 import improvo.cli.run, improvo.odometry.run
 from improvo.cli.main import main
 resource.setrlimit(resource.RLIMIT_FSIZE, ({room}, {room}))
-words = ["run", {str(walk)!r}, "-o", {str(out)!r}, "--frontend", "orb", "--max-keypoints", "400", "--quiet"]
-sys.exit(main(words))
+sys.exit(main([*{command.split()!r}, *{recording!r}, "-o", {str(out)!r}, "--quiet"]))
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
     assert "Traceback" not in done.stderr, done.stderr
     assert done.returncode == 2, done.stderr
     assert len(done.stderr.splitlines()) == 1
-    assert "cannot be written" in done.stderr
+    assert "cannot be written" in done.stderr or "if the disk is full" in done.stderr
     assert not [path for path in out.rglob("*") if ".partial" in path.name]
     for path in out.rglob("*.json"):
         json.loads(path.read_text())

@@ -31,7 +31,7 @@ SMALL = (
     *("--max-keypoints", "250", "--set", "labels.min_observations=6", "--set", "validation.gaps=[4,8]"),
     *("--set", "validation.matches.pairs=4", "--set", "validation.min_pairs=2"),
     *("--set", "split.share=0.3", "--set", "validation.calibration_images=2"),
-    *("--set", "odometry.start.max_homography_ratio=0.9", "--steps", "1"),
+    *("--set", "odometry.start.min_points=20", "--steps", "1"),
 )
 
 

@@ -11,7 +11,6 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -48,18 +47,15 @@ def test_help_of_every_command(words: tuple[str, ...]) -> None:
     assert "--quiet" in text
 
 
-def test_help_is_quick_and_lists_every_command() -> None:
-    seconds = []
-    for _ in range(3):
-        start = time.perf_counter()
-        shown = subprocess.run([sys.executable, "-m", "improvo", "--help"], capture_output=True, text=True, check=True)
-        seconds.append(time.perf_counter() - start)
-    bare = []
-    for _ in range(3):
-        start = time.perf_counter()
-        subprocess.run([sys.executable, "-c", "import argparse"], check=True)
-        bare.append(time.perf_counter() - start)
-    assert min(seconds) < max(0.2, 4 * min(bare))  # a busy machine is slow for both
+def test_help_loads_nothing_heavy_and_lists_every_command() -> None:
+    program = (
+        "import atexit, sys; from improvo.cli.main import main; "
+        "atexit.register(lambda: print(*sorted(sys.modules), file=sys.stderr)); main(['--help'])"
+    )
+    shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    loaded = set(shown.stderr.split())
+    assert "argparse" in loaded
+    assert not loaded & {"numpy", "cv2", "numba", "pyarrow", "yaml", "torch", "openvino"}  # help is there at once
     assert all(f"\n    {verb}" in shown.stdout for verb in COMMANDS)
     for verb, command in COMMANDS.items():
         assert all(f"\n    {part}" in help_of((verb,)) for part in command.parts), verb

@@ -62,16 +62,23 @@ def test_settings_under_their_former_names_are_read(tmp_path: Path) -> None:
 
     path = tmp_path / "settings.yaml"
     path.write_text(
-        "odometry:\n  initialisation: paper\n  trust:\n    least_stability: 0.25\n"
-        "  matching:\n    max_stray: 0.1\n  window:\n    constants: 7\n"
+        "odometry:\n  initialisation: paper\n  trust:\n    least_stability: 0.25\n  matching:\n    max_stray: 0.1\n"
     )
-    odometry = config.load(RunSettings, path, ["odometry.health.young_frames=9"]).odometry
+    odometry = config.load(RunSettings, path, ["odometry.matching.max_stray=0.2"]).odometry
     assert (odometry.mode, odometry.ransac_gate.least_stability) == ("paper", 0.25)
-    assert (odometry.matching.flow_outlier_limit, odometry.window.fixed) == (0.1, 7)
-    assert odometry.health.provisional_frames == 9
+    assert odometry.matching.flow_outlier_limit == 0.2
     assert config.load(RunSettings, path, ["odometry.mode=robust"]).odometry.mode == "robust"
     assert config.from_dict(OdometrySettings, {"initialisation": "paper"}).mode == "paper"
-    assert config.from_dict(OdometrySettings, {"start": {"min_matches": 60, "min_points": 7}}).start.min_points == 7
+
+
+@pytest.mark.parametrize("name", ["health.rounds", "start.min_matches", "solver.max_iterations", "window.max_error"])
+def test_a_setting_that_is_none_any_more_is_named_in_one_line(name: str) -> None:
+    from improvo.odometry.run_settings import RunSettings
+
+    with pytest.raises(ConfigError, match="leave it out") as raised:
+        config.load(RunSettings, None, [f"odometry.{name}=3"])
+    assert name.split(".")[0] in str(raised.value)
+    assert "\n" not in str(raised.value)
 
 
 def test_every_former_name_leads_to_a_setting() -> None:

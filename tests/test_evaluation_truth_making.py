@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -61,6 +62,19 @@ def made(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("made") / "truth.txt"
     assert main(["truth", str(walk), "-o", str(output), "--workers", "1", "--max-features", "700"]) == 0
     return output
+
+
+def test_what_does_not_fit_on_the_disk_is_refused_before_any_work(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("pycolmap")
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=1_000_000))
+    words = ["truth", str(walk), "-o", str(tmp_path / "truth.txt")]
+    assert main([*words, "--max-features", "10000"]) == 2
+    message = capsys.readouterr().err.splitlines()
+    assert len(message) == 1
+    assert "truth.work: needs about 57 MB, and 1 MB are free" in message[0]
+    assert not (tmp_path / "truth.work" / "images").exists()
 
 
 def test_poses_and_camera_are_those_that_were_rendered(made: Path) -> None:

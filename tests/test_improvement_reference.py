@@ -143,7 +143,7 @@ def test_gaps_follow_the_overlap_not_the_frame_rate() -> None:
 
 def test_steps_follow_the_amount_of_video() -> None:
     settings = ImproveSettings()
-    assert [steps_of(settings, frames) for frames in (40, 200, 5000)] == [300, 600, 1200]
+    assert [steps_of(settings, frames) for frames in (40, 600, 5000)] == [300, 600, 1200]
     few = replace(settings, held=replace(settings.held, optimiser=replace(settings.held.optimiser, steps=7)))
     assert steps_of(few, 40) == 7
     assert steps_of(replace(settings, steps_per_frame=0), 40) == 1200

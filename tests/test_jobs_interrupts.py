@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 
 import pytest
@@ -27,6 +28,23 @@ def test_termination_is_an_interrupt_within_the_block() -> None:
     with pytest.raises(KeyboardInterrupt), termination_interrupts():
         os.kill(os.getpid(), signal.SIGTERM)
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_termination_is_an_interrupt_after_colmap_was_loaded_too() -> None:
+    pytest.importorskip("pycolmap")
+    program = """
+import os, signal
+from improvo.evaluation.truth.structure_from_motion import load_pycolmap
+from improvo.jobs.interrupts import termination_interrupts
+try:
+    with termination_interrupts():
+        load_pycolmap()
+        os.kill(os.getpid(), signal.SIGTERM)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted\n", "")
 
 
 def test_a_handler_of_the_program_is_left_alone() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from simulated_features import CAMERA, hand_motion, room
 
-from improvo.backend.settings import ObjectiveSettings
 from improvo.geometry import se3
 from improvo.odometry.settings import VerdictSettings
 from improvo.odometry.verdict.evidence import PARTS, EvidenceCheck, Spread, error_percent
@@ -15,7 +14,6 @@ from improvo.types import Float64
 
 KEYFRAMES = 30
 TRUTH = se3.inverse(hand_motion(KEYFRAMES, step=0.08, turn_deg=0.8))
-SETTINGS = VerdictSettings()
 
 
 def spread_of(
@@ -32,7 +30,7 @@ def spread_of(
         seen: (N, P) whether a point may be seen by a keyframe; None: all.
         shift: (N, 2) pixels that what lies in the upper left quarter is off by.
     """
-    check = EvidenceCheck(CAMERA, SETTINGS, ObjectiveSettings(depth_weight=0.0))
+    check = EvidenceCheck(CAMERA)
     rng = np.random.default_rng(0)
     for i, pose in enumerate(cam_from_world):
         in_camera = se3.transform(pose, xyz)
@@ -66,7 +64,7 @@ def test_parts_of_good_evidence_agree() -> None:
     assert spread.error_percent.max() < 0.5
     assert np.abs(spread.scale_steps).max() < 0.03
     assert 0.25 < spread.noise_px < 0.35
-    verdict = judge(spread, SETTINGS)
+    verdict = judge(spread, VerdictSettings())
     assert verdict.word == RIGHT
     assert verdict.error_percent < 2.0
     assert verdict.uncertain == ()
@@ -108,7 +106,7 @@ def two_scales(shared: int) -> tuple[Float64, Float64, np.ndarray]:
 
 def test_a_scale_that_few_points_carry_on_is_marked_and_not_smoothed_over() -> None:
     cam_from_world, xyz, seen = two_scales(shared=5)
-    verdict = judge(spread_of(cam_from_world, xyz, seen=seen), SETTINGS)
+    verdict = judge(spread_of(cam_from_world, xyz, seen=seen), VerdictSettings())
     assert len(verdict.uncertain) == 1
     first, last = verdict.uncertain[0]
     assert first < KEYFRAMES // 2 <= last
@@ -117,7 +115,7 @@ def test_a_scale_that_few_points_carry_on_is_marked_and_not_smoothed_over() -> N
 
 def test_parts_that_disagree_about_the_scale_make_a_segment_doubtful() -> None:
     cam_from_world, xyz, seen = two_scales(shared=10)
-    verdict = judge(spread_of(cam_from_world, xyz, noise=1.5, seen=seen), SETTINGS)
+    verdict = judge(spread_of(cam_from_world, xyz, noise=1.5, seen=seen), VerdictSettings())
     assert verdict.word == DOUBTFUL
     assert any("the scale" in words for words in verdict.evidence)
 
@@ -125,7 +123,7 @@ def test_parts_that_disagree_about_the_scale_make_a_segment_doubtful() -> None:
 def test_three_keyframes_are_the_least_and_two_are_not_judged() -> None:
     xyz = room().points
     assert np.isfinite(spread_of(TRUTH[:3], xyz).error_percent).all()
-    check = EvidenceCheck(CAMERA, SETTINGS, ObjectiveSettings(depth_weight=0.0))
+    check = EvidenceCheck(CAMERA)
     assert check.finish(xyz) is None
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from simulated_features import CAMERA, hand_motion, nothing_to_see, observe, room, views_of
 
 from improvo.geometry import se3
+from improvo.odometry.gates import MEMORY_FRAMES
+from improvo.odometry.mapping import local_map as local_map_module
 from improvo.odometry.mapping.local_map import LocalMap
 from improvo.odometry.mapping.start import start_map
 from improvo.odometry.settings import OdometrySettings
@@ -118,14 +118,13 @@ def test_a_point_belongs_to_the_keypoints_of_its_track(mapped: tuple[LocalMap, l
             assert track_of.setdefault(int(view.points[row]), int(view.tracks[row])) == view.tracks[row]
 
 
-def test_points_not_seen_for_long_are_not_searched_for() -> None:
+def test_points_not_seen_for_long_are_not_searched_for(monkeypatch: pytest.MonkeyPatch) -> None:
     world = room()
-    settings = OdometrySettings()
-    brief = replace(settings, matching=replace(settings.matching, search_frames=1))
     observed = []
-    for each in (settings, brief):
+    for frames in (MEMORY_FRAMES, 1):
+        monkeypatch.setattr(local_map_module, "MEMORY_FRAMES", frames)
         views = views_of([observe(world, pose, seed=i) for i, pose in enumerate(TRUTH)])
-        local_map = start_map(views[:20], CAMERA, each, descriptor_distance=0.7)
+        local_map = start_map(views[:20], CAMERA, OdometrySettings(), descriptor_distance=0.7)
         assert isinstance(local_map, LocalMap)
         local_map.localise(views[20], views[19])
         observed.append(len(views[20].observed))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from improvo.config import from_dict, to_dict
+from improvo.odometry.paper import SOLVER
 from improvo.odometry.run_settings import LabelRunSettings, RunSettings, paper_run_settings
 from improvo.odometry.settings import PAPER, OdometrySettings
 
@@ -14,7 +15,7 @@ def test_it_is_the_scheme_of_the_paper() -> None:
     assert PAPER.matching.max_distance == 0.7
     assert PAPER.matching.flow_outlier_limit == 0.0
     assert PAPER.window.paper_poses == 30
-    assert PAPER.paper_solver.max_iterations == 100
+    assert SOLVER.max_iterations == 100
     objective = PAPER.paper_objective
     assert (objective.depth_min, objective.depth_max, objective.depth_weight) == (0.1, 5.0, 1.0)
 

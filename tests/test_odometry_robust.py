@@ -141,6 +141,16 @@ def test_a_map_contradicted_later_ends_its_segment_and_the_next_takes_its_last_f
     assert run.odometry.trajectory.segment.tolist() == [0] * second.first + [1] * (110 - second.first)
 
 
+def test_each_contradicted_map_of_the_same_frames_speaks_against_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    contradicts_at(monkeypatch, 30, 45)
+    twice = Run(walk(60)).odometry.segments[0].verdict.evidence
+    assert "each of 2 former maps of these frames was contradicted by two-view geometry" in twice
+    contradicts_at(monkeypatch, 75)
+    first, second = Run(walk(110)).odometry.segments
+    assert not any("a former map" in words for words in first.verdict.evidence)
+    assert any("a former map" in words for words in second.verdict.evidence)
+
+
 def test_frames_of_different_segments_have_different_worlds() -> None:
     elsewhere = [observe(room(7), pose, seed=500 + i) for i, pose in enumerate(hand_motion(50, step=0.03, seed=2))]
     run = Run(walk(50) + elsewhere)
@@ -158,10 +168,8 @@ def test_costly_failures_are_tried_again_ever_more_rarely(monkeypatch: pytest.Mo
         return InitFailure("the first views do not fit together", costly=True)
 
     monkeypatch.setattr(robust, "start_map", failing)
-    settings = OdometrySettings()
-    settings = replace(settings, start=replace(settings.start, max_cooldown=10))
-    Run(walk(60), settings)
-    assert np.diff(tried).tolist() == [3, 6, 10, 10, 10, 10]
+    Run(walk(60))
+    assert np.diff(tried).tolist() == [1, 2, 4, 8, 15, 15]
 
 
 def test_cheap_failures_are_tried_again_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,9 +184,8 @@ def test_cheap_failures_are_tried_again_at_once(monkeypatch: pytest.MonkeyPatch)
     assert tried == list(range(1, 20))
 
 
-def test_the_initialisation_buffer_is_bounded_and_gives_up_its_oldest_frames() -> None:
-    settings = OdometrySettings()
-    settings = replace(settings, start=replace(settings.start, max_buffered=5))
-    run = Run([observe(room(), TRUTH[0], seed=i) for i in range(20)], settings)  # a still camera
+def test_the_initialisation_buffer_is_bounded_and_gives_up_its_oldest_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robust, "_MAX_BUFFERED", 5)
+    run = Run([observe(room(), TRUTH[0], seed=i) for i in range(20)])  # a still camera
     assert [view.frame_index for view in run.final] == list(range(20))
     assert not run.odometry.trajectory.valid.any()

@@ -83,10 +83,10 @@ def test_a_run_written_under_former_names_is_read(tmp_path: Path) -> None:
     report = {
         "input": {"path": "walk"},
         "frames": {"source_index": [0, 1], "tracked": 0, "lost_frames": [0, 1]},
-        "configuration": {"odometry": {"initialisation": "paper", "window": {"constants": 20}}},
+        "configuration": {"odometry": {"initialisation": "paper", "matching": {"max_stray": 0.1}}},
         "events": [{"position": 1, "kind": "waiting", "detail": "too few matches"}],
     }
     (tmp_path / "run.json").write_text(json.dumps(report))
     run = RunFolder(tmp_path)
     assert run.report["events"] == [{"frame_index": 1, "kind": "initialising", "detail": "too few matches"}]
-    assert run.report["configuration"] == {"odometry": {"mode": "paper", "window": {"fixed": 20}}}
+    assert run.report["configuration"] == {"odometry": {"mode": "paper", "matching": {"flow_outlier_limit": 0.1}}}

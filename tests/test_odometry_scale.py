@@ -17,7 +17,7 @@ from rendered_walk import _TEXTURE, CAMERA, _texture, render_with_depth
 from simulated_features import hand_motion
 
 from improvo.cli.main import main
-from improvo.errors import ConfigError, InputError
+from improvo.errors import ConfigError, InputError, OutputError
 from improvo.geometry import se3
 from improvo.geometry.alignment import align_points
 from improvo.geometry.trajectory_files import read_trajectory, write_trajectory
@@ -173,7 +173,7 @@ def test_the_command_writes_metres_everywhere(room: Path, tmp_path: Path, capsys
         (["depths"], "give depth | truth"),
         (["distance", "3", "9"], "give depth | truth"),
         (["distance", "3", "9", "far"], "not numbers"),
-        (["distance", "3", "3", "1"], "no two places"),
+        (["distance", "3", "3", "1"], "improvo: --scale distance: frames 3 and 3 are no two places"),
         (["distance", "3", "99", "1"], "frame 99 is not among those that are read"),
         (["height", "-1.5"], "is no length"),
         (["height", "0"], "is no length"),
@@ -197,7 +197,7 @@ def test_a_source_that_is_not_there_is_said_before_any_work(tmp_path: Path, caps
     for words, what in (
         (["depth"], "has no depth images"),
         (["truth"], "has no true poses"),
-        (["marker", "0.16"], "no marker was seen"),
+        (["marker", "0.16"], "no marker was seen in at least 3 of 5 frames"),
     ):
         assert main(["run", str(walk), "-o", str(tmp_path / "out"), "--scale", *words, "--quiet"]) == 2
         assert what in capsys.readouterr().err
@@ -233,6 +233,23 @@ def test_contradictions_leave_the_run_as_it_is(
     assert before == {file.name: file.read_bytes() for file in run.folder.iterdir() if file.is_file()}
 
 
+def test_what_is_stopped_between_two_units_is_no_result(
+    finished: tuple[Sequence, RunSummary], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence, run = finished
+    ask = scale_source(sequence, ScaleSettings("truth"))
+    assert ask is not None
+
+    def full(*_: object, **__: object) -> None:
+        raise OutputError("the disk is full")
+
+    monkeypatch.setattr("improvo.odometry.scale.apply.write_trajectory", full)
+    with pytest.raises(OutputError):
+        apply_scale(sequence, run, ask, ScaleSettings("truth"))
+    with pytest.raises(InputError, match=r"has no run\.json"):  # the map is in metres, the trajectory is not
+        RunFolder(run.folder)
+
+
 def test_several_distances_are_averaged_and_contradictions_are_named(finished: tuple[Sequence, RunSummary]) -> None:
     sequence, run = finished
     tracked = TrackedRun(sequence, run)
@@ -246,8 +263,11 @@ def test_several_distances_are_averaged_and_contradictions_are_named(finished: t
     assert several.relative_error is not None
     assert several.relative_error < 0.02
     wrong = (*true[:2], (15, 35, 1.5 * true[2][2]))
-    with pytest.raises(InputError, match=r"frames \d+ and \d+ give .* m a unit, frames 15 and 35 give .* apart"):
+    with pytest.raises(InputError, match=r"frames \d+ and \d+ give .* m a unit, frames 15 and 35 give .* % apart"):
         scale_from_distance(tracked, ScaleSettings("distance", distances=wrong))
+    far_off = (true[0], (15, 35, 30 * true[2][2]))
+    with pytest.raises(InputError, match=r"frames 15 and 35 give .*, a factor of [23]\d\S* apart; measure again"):
+        scale_from_distance(tracked, ScaleSettings("distance", distances=far_off))
 
 
 def write_gps(path: Path, sequence: Sequence, every: int, began: float) -> None:

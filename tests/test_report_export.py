@@ -99,6 +99,23 @@ def test_points_have_the_colours_of_the_map_also_without_images(finished_run: Pa
     assert all(tuple(row) in of_map for row in model.rgb[known].tolist())
 
 
+def test_figures_of_a_colmap_model_as_json(
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = tmp_path / "scene"
+    assert main(["export", "colmap", str(finished_run), "-o", str(scene), "--no-images", "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    model = segment_model(RunFolder(finished_run), 0)
+    assert shown["models"][0] == {
+        "folder": str(scene / "sparse" / "0"),
+        "images": len(model.frames),
+        "points": len(model.xyz),
+        "observations": len(model.error),
+        "mean_error": pytest.approx(model.mean_error, abs=1e-6),
+    }
+    assert shown["map_points"] == len(RunFolder(finished_run).map)
+
+
 def test_images_of_an_export_are_the_frames(finished_run: Path, tmp_path: Path) -> None:
     assert main(["export", "colmap", str(finished_run), "-o", str(tmp_path / "c")]) == 0
     picture = cv2.imread(str(tmp_path / "c" / "images" / "frame_000004.png"), cv2.IMREAD_GRAYSCALE)

@@ -7,6 +7,7 @@ import re
 import shutil
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -217,7 +218,12 @@ def test_what_is_wrong_is_said_in_plain_words() -> None:
     assert "2 segments" in words(report(segments=[{"first": 0}, {"first": 6}]))
     verdict = {"word": "doubtful", "evidence": ["the parts disagree"], "uncertain": [], "error_percent": 8.0}
     doubted = {"number": 0, "first": 0, "last": 9, "verdict": verdict}
-    assert "Segment 0 (frames 0 to 9) is doubtful: the parts disagree." in words(report(segments=[doubted]))
+    said = words(report(segments=[doubted]))
+    assert "Segment 0 (frames 0 to 9) is doubtful: the parts disagree." in said
+    assert "makes no labels" in said
+    assert "zoomed" not in said
+    zoomed = {**doubted, "verdict": {**verdict, "evidence": ["the focal length changes"]}}
+    assert "zoomed" in words(report(segments=[zoomed]))
     assert "Check the calibration" in words(report(), error=2.5)
     skipped = [{"index": 3, "source": "a.png", "reason": "truncated"}]
     assert "a.png: truncated" in words(report(input={"skipped": skipped, "notes": []}))
@@ -286,6 +292,21 @@ def test_a_label_store_has_a_page_with_what_failed_and_why(finished_run: Path, t
     assert main(["report", str(labels / "walk"), "-o", str(tmp_path / "one.html")]) == 0
 
 
+def test_a_wide_table_and_the_map_fit_on_paper(page: Path, tmp_path: Path, browser: Any) -> None:
+    share = Measure("share", "of right matches")
+    rounds = [Round(name, {"share": 0.5}) for name in ("before", "round 1")]
+    header = ["right matches", *(f"{gap} frames ({gap / 30:.1f} s)" for gap in (6, 12, 18, 24))]
+    rows = [["round 1, share, 8 px", *["+0.1 % (-0.3 to +0.4)"] * 4]]
+    write_improvement_page(tmp_path / "wide.html", "Improvement", "", [share], rounds, gains=[header, *rows])
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    paper = {"width": 718, "height": 1000, "deviceScaleFactor": 1, "mobile": False}  # A4 without its margins
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", paper)
+    browser.get((tmp_path / "wide.html").as_uri())
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= 718
+    browser.get(page.as_uri())
+    assert browser.execute_script("return document.getElementById('scene').clientHeight") < 700
+
+
 def test_improvement_is_told_with_its_setbacks(tmp_path: Path) -> None:
     measures = [
         Measure("success", "share of pairs", digits=2),
@@ -313,4 +334,10 @@ def test_improvement_is_told_with_its_setbacks(tmp_path: Path) -> None:
     assert pair.index("before: matches") < pair.index("round 2: matches") < pair.index("</div>")
     assert "&lt;one&gt;" in text
     write_improvement_page(tmp_path / "none.html", "Improvement", "", measures, rounds, best=0)
-    assert "round 2, not kept: matches" in (tmp_path / "none.html").read_text()
+    none = (tmp_path / "none.html").read_text()
+    assert "round 2, not kept: matches" in none
+    assert "Nothing: the weights are those at the start." in none
+    assert "<h2>Labels" in none
+    unlabelled = [replace(entry, labels={}) for entry in rounds]
+    write_improvement_page(tmp_path / "held.html", "Improvement", "", measures, unlabelled)
+    assert "<h2>Labels" not in (tmp_path / "held.html").read_text()

@@ -186,12 +186,15 @@ def test_what_cannot_be_found_is_one_line_and_leaves_nothing(
         (["calibrate", str(shelf), "--from", "motion", "--board", "9x6:25mm"], "leave out --board"),
         (["calibrate", str(shelf), "--model", "brown8", "-o", str(out)], "needs a board"),
         (["info", str(short), "--camera", "auto"], "5 frames"),
+        (["run", str(short), "--camera", "auto", "-o", str(tmp_path / "auto")], "5 frames"),
+        (["label", str(short), str(shelf), "--camera", "auto", "-o", str(tmp_path / "auto")], "5 frames"),
     ):
         assert main(words) == 2, words
         lines = capsys.readouterr().err.strip().splitlines()
         assert says in lines[-1], words
         assert lines[-1].startswith("improvo: ")
         assert not out.exists()
+        assert not (tmp_path / "auto").exists()
 
 
 def test_run_without_a_camera_offers_to_find_it(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

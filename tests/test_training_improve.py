@@ -23,7 +23,7 @@ COMMAND = [
     *("--set", "labels.min_observations=6", "--set", "validation.gaps=[4,8]", "--set", "validation.matches.pairs=4"),
     *("--set", "validation.min_pairs=2", "--set", "split.share=0.3", "--set", "validation.calibration_images=2"),
     *("--set", "held.views.height=120", "--set", "held.views.width=160", "--control"),
-    *("--set", "odometry.start.max_homography_ratio=0.9"),  # the room is mostly one wall
+    *("--set", "odometry.start.min_points=20"),  # the room is mostly one wall
     *("--set", "held.optimiser.checkpoint_minutes=0", "--set", "held.optimiser.log_every=1"),
     *("--threads", "1"),
 ]

@@ -23,23 +23,30 @@ FORMER_NAMES: dict[str, dict[str, str]] = {
     "labels": {"second_opinion": "quality"},
     "improve": {"held_back": "split", "judge": "validation"},
     "odometry": {"initialisation": "mode", "trust": "ransac_gate"},
-    "matching": {
-        "max_stray": "flow_outlier_limit",
-        "refind_radius": "search_radius",
-        "refind_frames": "search_frames",
-    },
-    "start": {"max_waiting": "max_buffered", "max_patience": "max_cooldown"},
-    "window": {"constants": "fixed"},
-    "health": {"young_frames": "provisional_frames"},
+    "matching": {"max_stray": "flow_outlier_limit"},
     "pairs": {"rehearsed_share": "replay_share"},
 }
 
-# Settings that are no more, since their values followed from others; files that have them stay readable.
+# Settings of the odometry that are none any more (docs/odometry.md, "The numbers"): a message says so.
 FORMER_SETTINGS: dict[str, frozenset[str]] = {
-    "start": frozenset({"min_common_tracks", "min_matches", "min_off_plane_points"}),
-    "window": frozenset({"keyframe_interval"}),
-    "loss": frozenset({"min_inlier_share"}),
-    "health": frozenset({"min_inliers"}),
+    "odometry": frozenset({"health", "objective", "solver", "paper_solver"}),
+    "odometry.matching": frozenset({"search_radius", "search_frames"}),
+    "odometry.start": frozenset(
+        {"min_common_tracks", "min_matches", "min_off_plane_points", "min_rotation_residual", "max_buffered"}
+        | {"epipolar_error", "max_homography_ratio", "plane_ratio", "max_second_motion", "min_parallax_deg"}
+        | {"min_inlier_share", "max_mean_error", "max_lost", "max_cooldown"}
+    ),
+    "odometry.ransac_gate": frozenset({"enough"}),
+    "odometry.window": frozenset(
+        {"keyframe_interval", "keyframes", "fixed", "keyframe_motion", "keyframe_shared", "max_error"}
+    ),
+    "odometry.loss": frozenset({"min_inlier_share", "min_inliers", "wrong_share"}),
+    "odometry.refinement": frozenset({"max_start", "max_move", "min_correlation", "max_deviation", "max_area_ratio"}),
+    "odometry.verdict": frozenset(
+        {"window", "scale_share", "usual_noise", "max_focal_change", "max_focal_error", "max_scale_error"}
+    ),
+    "odometry.bridging": frozenset({"max_scale_error"}),
+    "odometry.attached": frozenset({"noise", "min_flow", "min_moving_cells"}),
 }
 
 
@@ -131,13 +138,14 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings", bas
     try:
         return _converter().structure(values, cls)
     except ClassValidationError as error:
-        raise ConfigError(f"{where}: {_first_reason(error)}") from None
+        first = _first_reason(error)
+        raise ConfigError(first if first.startswith("--") else f"{where}: {first}") from None
     except (TypeError, ValueError, OverflowError, AttributeError, LookupError) as error:
         raise ConfigError(f"{where}: {reason(error)}") from None
 
 
 def with_present_names(values: Any, section: str = "") -> Any:
-    """Nested dictionaries of settings as they are called now (see FORMER_NAMES), without FORMER_SETTINGS.
+    """Nested dictionaries of settings as they are called now (see FORMER_NAMES).
 
     Args:
         values: of one section, or of several as nested dictionaries.
@@ -147,8 +155,6 @@ def with_present_names(values: Any, section: str = "") -> Any:
         return values
     renamed = {}
     for key, value in values.items():
-        if key in FORMER_SETTINGS.get(section, ()):
-            continue
         present = _present_name(section, key)
         if present == key or present not in values:
             renamed[present] = with_present_names(value, present)
@@ -226,6 +232,8 @@ def _refuse_unknown_keys(cls: type, values: Any, where: str, prefix: str) -> Non
             shown = key if isinstance(key, str) and len(key) <= _LONGEST_VALUE else _shown(key)
             close = difflib.get_close_matches(shown, known, n=1)
             mend = f"did you mean `{prefix}{close[0]}`?" if close else f"known: {', '.join(known)}"
+            if key in FORMER_SETTINGS.get(prefix.rstrip("."), ()):
+                mend = "it follows from others now, or never mattered: leave it out"
             raise ConfigError(f"{where}: unknown setting `{prefix}{shown}`; {mend}")
         if dataclasses.is_dataclass(known[key]):
             _refuse_unknown_keys(known[key], value, where, f"{prefix}{key}.")
@@ -238,5 +246,5 @@ def _first_reason(error: Any) -> str:
         error = error.exceptions[0]
         path += [str(note).rsplit(" ", 1)[-1] for note in getattr(error, "__notes__", []) if "attribute" in note]
     where = ".".join(path)
-    named = not path or f"`{where}." in str(error) or f"`{where}`" in str(error)
+    named = not path or f"`{where}." in str(error) or f"`{where}`" in str(error) or str(error).startswith("--")
     return str(error) if named else f"setting `{where}`: {error}"

@@ -202,6 +202,14 @@ def make_output_folder(path: Path, command: str) -> None:
     clear_leftovers(path)
 
 
+def remove_unused_folder(path: Path) -> None:
+    """Remove an output folder that holds its marker and empty folders alone, since its command did nothing."""
+    if any(file.is_file() and file != path / MARKER for file in path.rglob("*")):
+        return
+    with suppress(OSError):
+        shutil.rmtree(path)
+
+
 def _is_temporary(path: Path) -> bool:
     """Whether `written_atomically` left this, in a process that was killed; it may have been the first file of all."""
     return path.name.startswith(".") and ".partial" in path.suffixes

@@ -26,7 +26,7 @@ def with_found_camera(settings: T, recordings: Sequence[Path], folder: Path | No
         command: that the folder belongs to.
 
     Raises:
-        InputError: no recording tells its camera.
+        InputError: no recording tells its camera; a folder that was not there is not there then.
         OutputError: the folder cannot be used.
     """
     from improvo.sequences.rates import AUTO
@@ -34,18 +34,24 @@ def with_found_camera(settings: T, recordings: Sequence[Path], folder: Path | No
     sequence = getattr(settings, "sequence")  # noqa: B009 - T has no bound that says so
     if sequence.camera != AUTO:
         return settings
-    from improvo.files import make_output_folder
+    from improvo.errors import InputError
+    from improvo.files import make_output_folder, remove_unused_folder
     from improvo.odometry.compile import compile_odometry
     from improvo.self_calibration.found_cameras import find_cameras
     from improvo.terminal import stages
 
+    kept = _kept(recordings) if folder is None else folder
+    new = folder is not None and not folder.exists()
     if folder is not None:
         make_output_folder(folder, command)
-    else:
-        folder = _kept(recordings)
     compile_odometry(notice)
-    with stages("step") as told:
-        found = find_cameras(recordings, sequence, folder, told=told, on_found=_say)
+    try:
+        with stages("step") as told:
+            found = find_cameras(recordings, sequence, kept, told=told, on_found=_say)
+    except InputError:
+        if new:
+            remove_unused_folder(kept)
+        raise
     changed: T = dataclasses.replace(settings, sequence=found)  # type: ignore[type-var]
     return changed
 

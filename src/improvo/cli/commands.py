@@ -98,7 +98,7 @@ COMMANDS: dict[str, Command] = {
         },
     ),
     "improve": Command(
-        "the main job: label video, train the frontend with the labels, keep it if it got better",
+        "the main job: train the frontend on your video by its own odometry, keep it if it got better",
         "improve",
         "improvo.improvement.settings:ImproveSettings",
         figures=True,
@@ -161,7 +161,7 @@ COMMANDS: dict[str, Command] = {
         "what other tools read: COLMAP, Nerfstudio, trajectories, features, ONNX",
         part_name="TARGET",
         parts={
-            "colmap": Command("a finished run as COLMAP's sparse model, with images", "export:colmap"),
+            "colmap": Command("a finished run as COLMAP's sparse model, with images", "export:colmap", figures=True),
             "nerfstudio": Command("a finished run as Nerfstudio's transforms.json, with images", "export:nerfstudio"),
             "trajectory": Command("the poses of a finished run as TUM, KITTI or EuRoC file", "export:trajectory"),
             "features": Command(

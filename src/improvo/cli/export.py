@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from improvo.cli.flags import add_setting
-from improvo.cli.output import next_step, say
+from improvo.cli.output import figures, next_step, say
 from improvo.cli.show_options import add_recording, add_run_folder, target_path
 from improvo.errors import OutputError
 
@@ -37,6 +37,7 @@ def run_colmap(arguments: argparse.Namespace) -> None:
     segments = segments_by_length(run_folder)
     models = [segment_model(run_folder, each, arguments.max_error, arguments.min_observations) for each in segments]
     make_output_folder(arguments.output, "export colmap")
+    written = []
     for number, model in enumerate(models):
         colours = None if arguments.no_images else _write_images(run_folder, model, arguments.output / "images")
         target = arguments.output / "sparse" / str(number)
@@ -45,6 +46,16 @@ def run_colmap(arguments: argparse.Namespace) -> None:
             f"{target}: {len(model.frames)} images, {_points(model)}, {len(model.error)} observations, "
             f"mean re-projection error {model.mean_error:.6f} px"
         )
+        written.append(
+            {
+                "folder": str(target),
+                "images": len(model.frames),
+                "points": len(model.xyz),
+                "observations": len(model.error),
+                "mean_error": round(model.mean_error, 6),
+            }
+        )
+    figures({"models": written, "map_points": len(run_folder.map)}, "")
     say(f"  the map of the run joins tracks of the same place to {len(run_folder.map)} points")
     next_step(f"open {arguments.output / 'sparse' / '0'} with COLMAP, pycolmap or what reads their model")
 

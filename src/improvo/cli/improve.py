@@ -1,4 +1,4 @@
-"""Self-improvement: label video with a network, train it with the labels, keep it if it got better on other video.
+"""Self-improvement: train a network on video by its own odometry, keep it if it got better on video it never saw.
 
 Leaves OUT/weights.safetensors, the best of all rounds and of the start, and OUT/report.html. Part of the video is held
 out and never trained on; run again to continue a run that was stopped, or with a higher --rounds.
@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_setting(group, defaults, "--minutes", "minutes")
     add_setting(group, defaults, "--control", "control")
     for flag, text in (
-        ("--steps", "of training (default: 2 for each frame, 300 to 1200 in all; 1000 with the recipe tracks)"),
+        ("--steps", "of training (default: 1 for each frame, 300 to 1200 in all; 1000 with the recipe tracks)"),
         ("--batch-size", "pairs of images a step (default: 2; 8 smaller ones with the recipe tracks)"),
     ):
         group.add_argument(flag, type=int, default=argparse.SUPPRESS, metavar="N", help=text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import sys
 import tempfile
@@ -28,6 +29,8 @@ _OPENCV_PACKAGES = (
 )
 _NO_MEMORY = "out of memory; give it more, or smaller pictures (--width), fewer keypoints or fewer --workers"
 _NO_FOLDER = "the folder that it runs in was removed; change to another one (cd) and run it again"
+_NO_SPACE = "no space is left on the disk; free some, or choose another folder"
+_ERRORS_OF_NO_SPACE = {getattr(errno, name) for name in ("ENOSPC", "EDQUOT", "EFBIG") if hasattr(errno, name)}
 _WORDS_OF_NO_MEMORY = ("insufficient memory", "can't allocate memory", "out of memory", "bad_alloc", "start new thread")
 
 
@@ -78,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
-        said = _NO_MEMORY if _out_of_memory(error) else _NO_FOLDER if _folder_is_gone(error) else ""
+        said = _limit_of_the_machine(error)
         if not said:
             raise
         print(f"improvo: {said}", file=sys.stderr)
@@ -96,6 +99,15 @@ def _say_if_opencv_is_there_twice() -> None:
             f"note: {' and '.join(found)} are both installed and overwrite each other's files, so windows "
             "(cv2.imshow) may be gone; docs/install.md says how to keep one"
         )
+
+
+def _limit_of_the_machine(error: Exception) -> str:
+    """What to say of an error that is none of ours, nor a fault of the program; empty for others."""
+    if _out_of_memory(error):
+        return _NO_MEMORY
+    if isinstance(error, OSError) and error.errno in _ERRORS_OF_NO_SPACE:
+        return _NO_SPACE
+    return _NO_FOLDER if _folder_is_gone(error) else ""
 
 
 def _out_of_memory(error: Exception) -> bool:

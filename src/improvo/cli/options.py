@@ -75,7 +75,7 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="one setting, such as odometry.loss.min_inliers=20",
+        help="one setting, such as odometry.loss.max_lost_frames=20",
     )
 
 

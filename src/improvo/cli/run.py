@@ -216,7 +216,7 @@ def _scale_lines(report: dict[str, Any]) -> list[str]:
 
 def _print_summary(summary: LabeledRun) -> None:
     from improvo.odometry.run_folder import why_no_pose
-    from improvo.odometry.verdict.told_verdicts import verdict_lines
+    from improvo.odometry.verdict.told_verdicts import verdict_lines, what_doubt_means
 
     report = summary.report
     frames, segments = report["frames"], report["segments"]
@@ -228,7 +228,7 @@ def _print_summary(summary: LabeledRun) -> None:
     for segment in segments[1:] if len(segments) > 1 else []:
         own = "" if report.get("metric") else "own scale, "
         say(f"  segment {segment['number']} starts at frame {segment['first']}: {own}placed by guess")
-    for line in [*verdict_lines(report), *_scale_lines(report)]:
+    for line in [*verdict_lines(report), *what_doubt_means(report), *_scale_lines(report)]:
         say(f"  {line}")
     warnings = [event for event in report["events"] if event["kind"] not in _UNSAID]
     for event in warnings[:_WARNINGS]:

@@ -83,8 +83,8 @@ def _is_video(arguments: argparse.Namespace) -> bool:
     return bool(arguments.video or (output is not None and output.suffix.lower() in MOVING))
 
 
-def chosen_frames(which: str, count: int) -> list[int]:
-    """The frames that `--frames` names, of `count`.
+def chosen_frames(which: str, count: int, flag: str = "--frames") -> list[int]:
+    """The frames that a flag names, of `count`.
 
     Raises:
         ConfigError: no such frames.
@@ -100,7 +100,7 @@ def chosen_frames(which: str, count: int) -> list[int]:
     if "," in which:
         wrong = [number for number in numbers if not 0 <= number < count]
         if wrong:
-            raise ConfigError(f"--frames {which}: there is no frame {wrong[0]}; frames are 0 to {count - 1}")
+            raise ConfigError(f"{flag} {which}: there is no frame {wrong[0]}; frames are 0 to {count - 1}")
         return numbers
     if numbers[0] < 1:
         raise ConfigError(f"--frames {which}: must be at least 1")

@@ -126,7 +126,7 @@ def _pair(text: str, sequence: Sequence) -> list[int]:
             step = float(np.median(np.diff(sequence.times))) if len(sequence) > 1 else 1.0
             later = max(1, round(later / step))
         second = str(int(first) + int(later))
-    frames = chosen_frames(f"{first},{second}", len(sequence))
+    frames = chosen_frames(f"{first},{second}", len(sequence), "--pair")
     if len(frames) != 2:
         raise mend
     return frames

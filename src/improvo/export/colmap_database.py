@@ -6,13 +6,14 @@ pixel at (0.5, 0.5); keypoints and principal point move by half a pixel.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from improvo.evaluation.truth.structure_from_motion import load_pycolmap
+from improvo.evaluation.truth.structure_from_motion import colmap_at, load_pycolmap
 from improvo.export.features import MatchedFrame
 from improvo.export.hloc import Written
 from improvo.files import write_text, written_atomically
@@ -39,7 +40,7 @@ def write_colmap_database(frames: Iterable[MatchedFrame], camera: Camera, folder
     pairs: list[str] = []
     keypoints = 0
     ids: dict[str, int] = {}
-    with written_atomically(folder / "database.db") as temporary:
+    with _database_file(folder / "database.db") as temporary:
         database = pycolmap.Database.open(str(temporary))
         try:
             own = pycolmap.Camera(
@@ -74,6 +75,22 @@ def write_colmap_database(frames: Iterable[MatchedFrame], camera: Camera, folder
         finally:
             database.close()
     return Written(len(ids), keypoints, verified, inliers)
+
+
+@contextmanager
+def _database_file(path: Path) -> Iterator[Path]:
+    """A temporary path that becomes `path`; SQLite's own files beside it go with it.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    with written_atomically(path) as temporary:
+        try:
+            with colmap_at(path):
+                yield temporary
+        finally:
+            for ending in ("-wal", "-shm", "-journal"):
+                temporary.with_name(temporary.name + ending).unlink(missing_ok=True)
 
 
 def _write_image(pycolmap: Any, database: Any, name: str, camera: Any, rig: Any) -> int:

@@ -6,6 +6,7 @@ them to COLMAP. Keypoints stay float32: float16, which hloc writes itself, round
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +41,36 @@ def check_h5py() -> Any:
     return imported("h5py", "writing hloc's HDF5 files", "hdf5")
 
 
+class _WritableFile(io.FileIO):
+    """A file for HDF5 that keeps its first error for `check`: raised in the middle, HDF5 prints it when it closes."""
+
+    error: OSError | None = None
+
+    def write(self, data: Any, /) -> int:
+        """All of the bytes, or none of them once there was an error."""
+        rest = memoryview(data).cast("B")
+        size = len(rest)
+        try:
+            while rest and self.error is None:
+                rest = rest[super().write(rest) :]
+        except OSError as error:
+            self.error = error
+        return size
+
+    def truncate(self, size: int | None = None, /) -> int:
+        """Likewise."""
+        try:
+            return super().truncate(size) if self.error is None else 0
+        except OSError as error:
+            self.error = error
+            return 0
+
+    def check(self) -> None:
+        """Raise the error, if there was one."""
+        if self.error is not None:
+            raise self.error
+
+
 def write_hloc(frames: Iterable[MatchedFrame], camera: Camera, folder: Path, descriptors: str) -> Written:
     """Write `features.h5`, `matches.h5`, `pairs.txt`, and `intrinsics.txt` in the form of hloc's lists of queries.
 
@@ -59,8 +90,10 @@ def write_hloc(frames: Iterable[MatchedFrame], camera: Camera, folder: Path, des
     with (
         written_atomically(folder / "features.h5") as features_file,
         written_atomically(folder / "matches.h5") as matches_file,
-        h5py.File(features_file, "w", libver="latest") as of_images,
-        h5py.File(matches_file, "w", libver="latest") as of_pairs,
+        _WritableFile(features_file, "w+b") as features_out,
+        _WritableFile(matches_file, "w+b") as matches_out,
+        h5py.File(features_out, "w", libver="latest") as of_images,
+        h5py.File(matches_out, "w", libver="latest") as of_pairs,
     ):
         counts: dict[str, int] = {}
         for frame in frames:
@@ -81,6 +114,12 @@ def write_hloc(frames: Iterable[MatchedFrame], camera: Camera, folder: Path, des
                 matches += len(found)
             names.append(frame.name)
             keypoints += len(frame.features)
+            features_out.check()
+            matches_out.check()
+        of_images.flush()
+        of_pairs.flush()
+        features_out.check()
+        matches_out.check()
     numbers = (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5)  # COLMAP's pixels
     pinhole = f"PINHOLE {camera.width} {camera.height} {' '.join(repr(float(value)) for value in numbers)}"
     write_text(folder / "intrinsics.txt", "".join(f"{name} {pinhole}\n" for name in names))

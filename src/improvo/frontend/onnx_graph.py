@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from improvo.errors import MissingExtraError
+from improvo.errors import imported
 from improvo.frontend.architecture import CELL, POOL_AFTER
 from improvo.frontend.int8 import (
     ACTIVATION_MAX,
@@ -38,14 +38,10 @@ class OnnxGraph:
     """
 
     def __init__(self, feature: str) -> None:
-        try:
-            import onnx
-            from onnx import helper, numpy_helper
-        except ImportError:
-            raise MissingExtraError(feature, "onnx") from None
+        self._onnx = imported("onnx", feature, "onnx")
+        self._helper, self._numpy_helper = self._onnx.helper, self._onnx.numpy_helper
         self.nodes: list[Any] = []
         self.constants: list[Any] = []
-        self._onnx, self._helper, self._numpy_helper = onnx, helper, numpy_helper
 
     def node(self, kind: str, *inputs: str, name: str | None = None, outputs: int = 1, **attributes: Any) -> Any:
         """Add a node; returns the name of its output, or a list of names."""

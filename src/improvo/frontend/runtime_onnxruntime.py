@@ -7,18 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from improvo.errors import MissingExtraError
+from improvo.errors import imported
 from improvo.frontend.onnx_graph import NetworkNodes, OnnxGraph, add_heat_map
 from improvo.frontend.runtime import NetworkMaps
 from improvo.frontend.weights import Weights
 from improvo.types import Float32
 
-try:
-    import onnxruntime
-except ImportError:
-    raise MissingExtraError("the ONNX runtime", "onnxruntime") from None
-
 _FEATURE = "the ONNX runtime"
+onnxruntime = imported("onnxruntime", _FEATURE, "onnxruntime")
 _ERRORS_ONLY = 3  # severity of its log
 
 

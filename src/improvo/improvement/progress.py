@@ -89,7 +89,8 @@ class ImprovementProgress:
             text += f"; in all {gain_words(validation, start, settings)}"
             for one in validation.earlier:
                 text += f"; {one} {gain(validation, start, name, settings.matches, earlier=one).words}"
-        text += f"; {validation.tracked} of {validation.frames} frames tracked in {validation.segments} segments"
+        text += f"; {validation.tracked} of {validation.frames} frames tracked in "
+        text += counted(validation.segments, "segment")
         self.line(text if better is None else f"{text}; {'better, kept' if better else 'not better, not kept'}")
 
 

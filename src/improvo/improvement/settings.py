@@ -95,7 +95,7 @@ class ImproveSettings:
     control: bool = False  # also train, from the same start, by homographies of the same frames alone, and show it
     minutes: float = 0.0  # that training may take in each round; 0: as many steps as the following say
     # for each frame of the training part, at least 300 in all and at most `held.optimiser.steps`; 0: exactly those
-    steps_per_frame: float = 2.0
+    steps_per_frame: float = 1.0
     held: HeldSettings = field(
         default_factory=lambda: HeldSettings(
             frozen_layers=4,  # whose features of a frame are remembered

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from improvo.backend.settings import SolverSettings
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.odometry.alarms.health import HealthCheck
 from improvo.odometry.events import EventLog
+from improvo.odometry.gates import FEWEST
 from improvo.odometry.mapper import Mapper
 from improvo.odometry.mapping.local_map import LocalMap
 from improvo.odometry.mapping.window import adjust
@@ -21,6 +23,8 @@ from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import TrackingState
 from improvo.odometry.view import NO_POINT, View, inherit_points
 from improvo.types import Float64
+
+SOLVER = SolverSettings(max_iterations=100, relative_decrease=1e-6)  # the paper's 100, and hardly ever less
 
 
 class PaperMapper(Mapper):
@@ -59,7 +63,7 @@ class PaperMapper(Mapper):
             self._map.store,
             self._camera.K,
             self._settings.paper_objective,
-            self._settings.paper_solver,
+            SOLVER,
             max_error=None,
         )
         self._result.add_window(report)
@@ -91,7 +95,7 @@ class PaperMapper(Mapper):
         """The pose of the previous view, if enough tracks go on."""
         previous = self._window[-1]
         inherit_points(view, previous)
-        if len(view.observed) < self._settings.loss.min_inliers:
+        if len(view.observed) < FEWEST:
             return False
         assert previous.cam_from_world is not None
         view.cam_from_world = previous.cam_from_world.copy()

@@ -7,6 +7,7 @@ from improvo.odometry.alarms.attached import AttachedDetector
 from improvo.odometry.alarms.focal_change import LensWatch
 from improvo.odometry.alarms.health import HealthCheck
 from improvo.odometry.events import EventLog
+from improvo.odometry.gates import MEMORY_FRAMES, gate
 from improvo.odometry.mapper import Mapper
 from improvo.odometry.mapping.bridging import Bridging
 from improvo.odometry.mapping.former_map import FormerMap
@@ -14,7 +15,7 @@ from improvo.odometry.mapping.initial_pair import InitFailure
 from improvo.odometry.mapping.local_map import LocalMap
 from improvo.odometry.mapping.sliding_window import SlidingWindow
 from improvo.odometry.mapping.start import start_map
-from improvo.odometry.mapping.window import WindowReport, adjust
+from improvo.odometry.mapping.window import OBJECTIVE, SOLVER, WindowReport, adjust
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import StateMachine, TrackingState
@@ -23,8 +24,9 @@ from improvo.odometry.view import Mask, View
 from improvo.types import Float64
 
 _CARRIED = 0.2  # share of the observations that turned out to move with the camera; with more the map is wrong
-_FIRST_COOLDOWN = 3  # frames after a costly failure to start; it doubles with each further one
+_MAX_BUFFERED = 300  # frames in the initialisation buffer; the oldest leaves it without a pose
 _LOST = "lost"  # why a segment ended
+_TWO_VIEWS = "two-view geometry"  # what contradicted it
 
 
 class RobustMapper(Mapper):
@@ -44,12 +46,13 @@ class RobustMapper(Mapper):
         self._cooldown = 0  # frames to wait before the next try to start
         self._costly_failures = 0  # since the last map
         self._worlds = 0  # maps started
-        self._lens = LensWatch(camera, settings.window.max_error, settings.seed)
+        self._lens = LensWatch(camera, settings.tolerance, settings.seed)
+        self._contradicted = 0  # maps in a row by two-view geometry, each over frames of the one before
         self._carried = False  # a large part of the map has turned out to move with the camera
         self._window = SlidingWindow(settings.window, camera.width)
         self._health = HealthCheck(camera, settings, descriptor_distance)
         self._judge = SegmentJudge(camera, settings)
-        self._bridging = Bridging(settings.bridging)
+        self._bridging = Bridging(settings)
         self._provisional: list[View] = []  # all views of a provisional map with a pose, in order; none is final
         self._attached = AttachedDetector(camera, settings, descriptor_distance)
 
@@ -91,7 +94,7 @@ class RobustMapper(Mapper):
             self._start_anew(view, "what moves with the camera")
             return
         if self._health.contradicts(view, {earlier.frame_index: earlier for earlier in self._map.history}):
-            self._start_anew(view, "two-view geometry")
+            self._start_anew(view, _TWO_VIEWS)
             return
         if self._health.ambiguous:
             self._events.two_motions(view.frame_index)
@@ -118,7 +121,7 @@ class RobustMapper(Mapper):
     def _initialise(self, view: View) -> None:
         self._buffer.append(view)
         self._cooldown -= 1
-        if len(self._buffer) > self._settings.start.max_buffered:
+        if len(self._buffer) > _MAX_BUFFERED:
             self._result.give_up([self._buffer.pop(0)])
         if len(self._buffer) >= 2 and self._cooldown <= 0:
             self._try_to_start(view)
@@ -129,8 +132,7 @@ class RobustMapper(Mapper):
         if isinstance(started, InitFailure):
             self._events.initialisation_failed(view.frame_index, started.reason)
             if started.costly:
-                longest = self._settings.start.max_cooldown
-                self._cooldown = min(_FIRST_COOLDOWN * 2**self._costly_failures, longest)
+                self._cooldown = min(2**self._costly_failures, self._settings.window.recent)
                 self._costly_failures += 1
             return
         self._map = started
@@ -140,6 +142,9 @@ class RobustMapper(Mapper):
         if self._lens.factor != 1.0:
             self._events.focal_length(self._buffer[0].frame_index, self._lens.factor, "the segment is doubtful")
             self._judge.alarm(f"the focal length is about {self._lens.factor:.2f} times that of the camera as given")
+        if self._contradicted:
+            maps = "a former map" if self._contradicted == 1 else f"each of {self._contradicted} former maps"
+            self._judge.suspicion(f"{maps} of these frames was contradicted by {_TWO_VIEWS}", self._contradicted)
         self._result.begin_segment()
         self._result.give_up(each for each in self._buffer if each.cam_from_world is None)
         self._health = HealthCheck(self._camera, self._settings, self._descriptor_distance)
@@ -165,20 +170,12 @@ class RobustMapper(Mapper):
 
     def _adjust_window(self, local_map: LocalMap) -> WindowReport:
         free, fixed = self._window.free_and_fixed()
-        settings = self._settings
-        return adjust(
-            free,
-            fixed,
-            local_map.store,
-            self._camera.K,
-            settings.objective,
-            settings.solver,
-            settings.window.max_error,
-        )
+        max_error = gate(self._settings.tolerance)
+        return adjust(free, fixed, local_map.store, self._camera.K, OBJECTIVE, SOLVER, max_error)
 
     def _confirm(self) -> None:
         """A map that nothing contradicted for long enough is trusted, and its old frames become final."""
-        if self._states.is_provisional and len(self._provisional) > self._settings.health.provisional_frames:
+        if self._states.is_provisional and len(self._provisional) > MEMORY_FRAMES:
             self._states.map_confirmed()
             self._provisional = []
 
@@ -209,6 +206,7 @@ class RobustMapper(Mapper):
 
     def _start_anew(self, view: View, by: str) -> None:
         """The map is wrong: a provisional one starts anew over all its frames, another one over its last frames."""
+        contradicted = self._contradicted + (by == _TWO_VIEWS)
         if self._states.is_provisional:
             self._events.contradicted(view.frame_index, "the map is started anew", by)
             self._buffer = self._provisional
@@ -219,6 +217,7 @@ class RobustMapper(Mapper):
             doubtful, self._window.recent = self._window.recent, []
             self._end_segment(f"contradicted by {by}")
             self._buffer = doubtful
+        self._contradicted = contradicted
         for each in self._buffer:
             each.forget_pose()
         self._try_to_start(view)
@@ -262,6 +261,7 @@ class RobustMapper(Mapper):
         segment = self._result.end_segment(xyz, reason, self._judge.verdict(xyz))
         if segment is not None:
             self._events.judged(segment)
+        self._contradicted = 0
         self._clear()
         self._states.map_ended()
 
@@ -269,7 +269,6 @@ class RobustMapper(Mapper):
         """What a later map may be joined with; a map that was contradicted is none."""
         if reason != _LOST:
             return
-        settings = self._settings
         former = FormerMap(
             self._result.running_segment,
             self._result.placement,
@@ -277,8 +276,8 @@ class RobustMapper(Mapper):
             local_map.store.xyz,
             self._camera,
             self._descriptor_distance,
-            settings.window.max_error,
-            settings.seed,
+            gate(self._settings.tolerance),
+            self._settings.seed,
         )
         self._bridging.remember(former)
 

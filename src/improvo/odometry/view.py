@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from improvo.odometry.settings import RansacGateSettings
+from improvo.odometry.settings import OdometrySettings
 from improvo.types import Float32, Float64, Int64, UInt8
 
 NO_POINT = -1
+_ENOUGH = 50  # keypoints for a RANSAC; with fewer stable ones all are used, since a doubtful pose is better than none
 Mask = NDArray[np.bool_]
 
 
@@ -101,25 +102,25 @@ def common_tracks(a: View, b: View) -> tuple[Int64, Int64]:
     return rows_a.astype(np.int64), rows_b.astype(np.int64)
 
 
-def ransac_pairs(a: View, b: View, matches: Int64, gate: RansacGateSettings) -> Mask:
+def ransac_pairs(a: View, b: View, matches: Int64, settings: OdometrySettings) -> Mask:
     """Which matches a RANSAC may use: those whose keypoints are both likely to be stable.
 
     Args:
         a: the first view.
         b: the second view.
         matches: (K, 2) rows of `a` and of `b`.
-        gate: its settings.
+        settings: of the odometry; `ransac_gate` is used.
 
     Returns:
         (K,) mask.
     """
-    return ransac_rows(np.minimum(a.weights[matches[:, 0]], b.weights[matches[:, 1]]), gate)
+    return ransac_rows(np.minimum(a.weights[matches[:, 0]], b.weights[matches[:, 1]]), settings)
 
 
-def ransac_rows(weights: Float64, gate: RansacGateSettings) -> Mask:
+def ransac_rows(weights: Float64, settings: OdometrySettings) -> Mask:
     """(N,) which of the weights w_ij are high enough for a RANSAC; all of them, where those would be too few."""
-    stable = weights >= gate.least_stability
-    return stable if stable.sum() >= gate.enough else np.ones(len(weights), bool)
+    stable = weights >= settings.ransac_gate.least_stability
+    return stable if stable.sum() >= _ENOUGH else np.ones(len(weights), bool)
 
 
 def inherit_points(view: View, neighbour: View) -> None:

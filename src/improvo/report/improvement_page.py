@@ -73,7 +73,8 @@ def write_improvement_page(
     if verdict:
         page.paragraph(verdict)
     page.heading("What to look out for")
-    page.warnings([*notes, *_setbacks(measures, first, last)], "Nothing: every measure is at least as good as before.")
+    nothing = "every measure is at least as good as before" if best else "the weights are those at the start"
+    page.warnings([*notes, *_setbacks(measures, first, last)], f"Nothing: {nothing}.")
     if len(gains) > 1:
         page.heading("Gain over the start")
         page.table(list(gains[0]), [list(row) for row in gains[1:]], "In brackets 95 % intervals over the same pairs.")
@@ -98,13 +99,14 @@ def write_improvement_page(
     in_order = [entry for entry in rounds if not entry.aside]
     if len(in_order) > 2:
         _curves(page, measures, in_order)
-    page.heading("Labels")
     names = list(dict.fromkeys(name for entry in rounds for name in entry.labels))
-    page.table(
-        ["made with", *names],
-        [[entry.name, *(f"{entry.labels.get(name, 0):,}" for name in names)] for entry in rounds if entry.labels],
-        "Tracks by label; more and longer tracks teach more. " + LABEL_WORDS,
-    )
+    if names:
+        page.heading("Labels")
+        page.table(
+            ["made with", *names],
+            [[entry.name, *(f"{entry.labels.get(name, 0):,}" for name in names)] for entry in rounds if entry.labels],
+            "Tracks by label; more and longer tracks teach more. " + LABEL_WORDS,
+        )
     page.heading("Time")
     for entry in rounds:
         if entry.seconds:

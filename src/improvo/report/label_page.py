@@ -36,7 +36,7 @@ def write_label_page(folder: Path, path: Path, palette: Palette = PALETTES["pape
     totals = {name: sum(int(row[name]) for row in rows) for name in ("stable", "unstable", "ignore", "withheld")}
     page = Page(
         f"Labels of {_named([str(row['name']) for row in rows])}",
-        f"{counted(len(rows), 'sequence')}, labelled by `improvo label`.",
+        f"{counted(len(rows), 'sequence')}, labelled by the command improvo label.",
     )
     page.tiles(
         [

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from improvo.odometry.verdict.told_verdicts import verdict_lines
+from improvo.odometry.verdict.told_verdicts import verdict_lines, what_doubt_means
 from improvo.odometry.verdict.verdict import DOUBTFUL
 from improvo.types import Float64, Int64
 
@@ -34,7 +34,8 @@ def warnings(report: dict[str, Any], shown: Int64, brightness: Float64, median_e
         lines.append(
             "No frame has a pose: the camera moved too little, only turned, or saw too little texture. Move sideways."
         )
-    lines += [f"{line[0].upper()}{line[1:]}." for line in verdict_lines(report, only=DOUBTFUL)]
+    doubts = [*verdict_lines(report, only=DOUBTFUL), *what_doubt_means(report)]
+    lines += [f"{line[0].upper()}{line[1:]}." for line in doubts]
     lines += _events(report)
     if frames["lost"]:
         lines.append(f"{frames['lost']} of {frames['processed']} frames have no pose: {ranges(frames['lost_frames'])}.")

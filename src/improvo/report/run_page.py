@@ -93,7 +93,9 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
     )
     page.heading("What to look out for")
     page.warnings(warnings(report, shown, brightness, median_error), "Nothing: every frame has a pose, in one segment.")
-    page.paragraph(" ".join(f"{line[0].upper()}{line[1:]}." for line in verdict_lines(report)))
+    believed = [line for line in verdict_lines(report) if line not in verdict_lines(report, only=DOUBTFUL)]
+    if believed:
+        page.paragraph(" ".join(f"{line[0].upper()}{line[1:]}." for line in believed))
     if len(run.trajectory):
         _map_section(page, run, palette, truth)
     _frames_section(page, run, data, palette, missing)
@@ -200,7 +202,7 @@ def _labels_section(page: Page, run: RunFolder, palette: Palette) -> None:
     page.paragraph(
         f"A track of at least {rule['min_observations']} observations is stable if its mean re-projection error is "
         f"at most {rule['stable_mean_error']:g} px, unstable if its largest is at least "
-        f"{rule['unstable_max_error']:g} px, and ignored otherwise. Labels are what the frontend learns from."
+        f"{rule['unstable_max_error']:g} px, and ignored otherwise. A frontend can be trained on these labels."
     )
     names = ("stable", "unstable", "ignore", "withheld")
     rows = [(name, float(tracks[name]), f"{tracks[name]:,}") for name in names]

@@ -15,7 +15,7 @@ from improvo.self_calibration.elimination import back_substitute, eliminate
 from improvo.self_calibration.lens import Lens
 from improvo.types import Float64, Int64
 
-LOSS_WIDTH = 0.5  # pixels, of Cauchy's loss
+LOSS_WIDTH = 0.25  # pixels, of Cauchy's loss: below the noise, so that points that drift along an edge count little
 _FITS = 3.0  # pixels, of observations that are no outliers
 _ITERATIONS, _RELATIVE_DECREASE = 60, 1e-7
 # What is known of any lens before a picture is seen: pixels are square, the middle of the picture is near the optical

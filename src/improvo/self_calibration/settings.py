@@ -23,7 +23,7 @@ class SelfCalibrationSettings:
     max_rate: float = 15.0  # frames a second that are looked at
     max_width: int = 1280  # pixels in which keypoints are detected
     pairs: int = 16  # of frames, for the first guess
-    views: int = 70  # adjusted together with the camera
+    views: int = 140  # adjusted together with the camera
     rounds: int = 3  # of odometry and adjustment, at most
     max_focal_deviation: float = 0.01  # of the focal length; a camera that is less sure is refused
     max_rms: float = 1.5  # pixels; a worse fit is refused

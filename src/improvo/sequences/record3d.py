@@ -6,13 +6,14 @@ Depth inside an archive is LZFSE-compressed and needs the extra `record3d`; with
 from __future__ import annotations
 
 import zipfile
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from improvo.errors import InputError
+from improvo.errors import InputError, installed
 from improvo.geometry.se3 import rigid, rotation_from_quat_xyzw
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
 from improvo.sequences.images import decode, depth_in_metres, natural_key
@@ -183,8 +184,4 @@ def _positive(value: Any) -> float | None:
 
 def _lzfse() -> Any:
     """The decompressor, None where its package is not installed."""
-    try:
-        import liblzfse  # type: ignore[import-not-found, unused-ignore]
-    except ImportError:
-        return None
-    return liblzfse.decompress
+    return import_module("liblzfse").decompress if installed("liblzfse") else None

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from improvo.errors import InputError, MissingExtraError
+from improvo.errors import InputError, imported
 from improvo.sequences import ros_messages
 from improvo.sequences.base import UnreadableFrameError
 from improvo.types import Float64, Int64
@@ -29,14 +29,10 @@ def open_reader(path: Path) -> Any:
         MissingExtraError: `rosbags` is not installed.
         InputError: the bag cannot be read.
     """
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise MissingExtraError("reading ROS bags", "ros") from None
+    bags, types = (imported(f"rosbags.{part}", "reading ROS bags", "ros") for part in ("highlevel", "typesys"))
     _bound_decompressors()
     try:
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader = bags.AnyReader([path], default_typestore=types.get_typestore(types.Stores.ROS2_HUMBLE))
         reader.open()
     except Exception as error:  # a damaged bag may fail anywhere in three container formats and their codecs
         mend = (

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import concurrent.futures
-import multiprocessing
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -15,6 +13,7 @@ import numpy as np
 from improvo.config import to_dict
 from improvo.files import make_output_folder, write_json, written_atomically
 from improvo.geometry.camera import Camera
+from improvo.jobs.pool import Workers
 from improvo.simulation.causes import Cause, cause_image
 from improvo.simulation.flow import image_motion
 from improvo.simulation.renderer import SceneRenderer, camera_of
@@ -108,7 +107,7 @@ def simulate_many(
     depth_every: int = 1,
     progress: Callable[[], object] = lambda: None,
 ) -> list[Path]:
-    """Render recordings with the seeds `settings.seed`, +1, ... into `folder/scene-SEED`, in parallel.
+    """Render recordings with the seeds `settings.seed`, +1, ... into `folder/scene-SEED`, by `workers` processes.
 
     Returns:
         Their folders. `progress` is called after every recording.
@@ -116,21 +115,16 @@ def simulate_many(
     make_output_folder(folder, "simulate")
     jobs = [replace(settings, seed=settings.seed + number) for number in range(scenes)]
     targets = [folder / f"scene-{job.seed:04d}" for job in jobs]
-    context = multiprocessing.get_context("spawn")  # OpenGL contexts do not survive a fork
-    with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread) as pool:
-        futures = [
-            pool.submit(simulate, job, target, jpeg_quality, depth_every)
-            for job, target in zip(jobs, targets, strict=True)
-        ]
-        for future in concurrent.futures.as_completed(futures):
-            future.result()
+    tasks = [(job, target, jpeg_quality, depth_every) for job, target in zip(jobs, targets, strict=True)]
+    with Workers(workers) as pool:
+        for _ in pool.run(_simulate_alone, tasks, "simulate"):
             progress()
     return targets
 
 
-def _one_thread() -> None:
+def _simulate_alone(task: tuple[SimulationSettings, Path, int | None, int]) -> None:
     os.environ["LP_NUM_THREADS"] = "1"  # the software rasteriser's threads
-    cv2.setNumThreads(1)
+    simulate(*task)
 
 
 def _write_labels(path: Path, causes: UInt8) -> None:

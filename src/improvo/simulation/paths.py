@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from improvo.errors import ConfigError, MissingExtraError
+from improvo.errors import ConfigError, imported
 from improvo.geometry.se3 import rigid, so3_exp
 from improvo.simulation.room import Floor
 from improvo.simulation.settings import SimulationSettings
 from improvo.types import Float64
 
-try:
-    from scipy.interpolate import CubicSpline, PchipInterpolator
-except ImportError:
-    raise MissingExtraError("simulate", "simulate") from None
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
+
+interpolate = imported("scipy.interpolate", "simulate", "simulate")
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ def floor_path(rng: np.random.Generator, floor: Floor, clearance: float, speed: 
     dense = loops[best][:: -1 if rng.uniform() < 0.5 else 1].copy()
     steps = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(dense, axis=0), axis=1))])
     dense[-1] = dense[0]
-    spline = CubicSpline(steps, dense, bc_type="periodic")
+    spline = interpolate.CubicSpline(steps, dense, bc_type="periodic")
     return FloorPath(spline, float(steps[-1]), speed, float(rng.uniform(0, steps[-1])))
 
 
@@ -72,9 +73,9 @@ class CameraPath:
         duration = settings.frames / settings.fps
         self._height = float(rng.uniform(1.35, 1.6))
         knots = np.arange(-3.0, duration + 6.0, 2.5)
-        self._yaw = PchipInterpolator(knots, self._look_around(rng, floor, knots))
-        self._pitch = PchipInterpolator(knots, np.radians(rng.uniform(-28, -4, len(knots))))
-        self._roll = PchipInterpolator(knots, np.radians(rng.normal(0, 1.5, len(knots))))
+        self._yaw = interpolate.PchipInterpolator(knots, self._look_around(rng, floor, knots))
+        self._pitch = interpolate.PchipInterpolator(knots, np.radians(rng.uniform(-28, -4, len(knots))))
+        self._roll = interpolate.PchipInterpolator(knots, np.radians(rng.normal(0, 1.5, len(knots))))
         self._pace = settings.speed / 0.35 * 1.5  # steps per second
         self._hand = _Tremor(rng, 3, (0.4, 2.0), 0.003 * settings.hand_jitter)
         self._shake = _Tremor(rng, 3, (0.5, 5.0), np.radians(0.3) * settings.hand_jitter)

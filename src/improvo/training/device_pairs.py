@@ -3,51 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from improvo.errors import InputError
-from improvo.frontend.architecture import CELL
-from improvo.training.alignment import aligned
 from improvo.training.distributed import Process
 from improvo.training.held_settings import HeldSettings
+from improvo.training.pair_points import PairPlan, PairPoints
 from improvo.training.photometric_batch import augment_batch
 from improvo.training.picture_store import MaskStore, PictureStore, on_device
 from improvo.training.pictures import Pictures, Source
 from improvo.training.posed import PosedSequence, overlapping_pairs
-from improvo.training.posed_frames import Carried, PosedFrames
+from improvo.training.posed_frames import PosedFrames
 from improvo.training.random_views import random_views
 from improvo.training.teacher import Teacher
-from improvo.training.view_points import cell_corners, cell_keypoints, warped, within
 from improvo.training.views import inside, warp_points
 from improvo.training.whole_frames import WholeFrames
 from improvo.types import Float64, Int64
-
-_SPREAD = 1.0  # of the random part of a keypoint's score, beside the logarithm of its probability
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """The pairs of one batch: pictures, homographies between them where depth does not relate them, and views."""
-
-    rows: Int64  # (B, 2) pictures a, b of the store
-    scenes: Int64  # (B,) pairs of one scene may show the same places
-    b_from_a: Float64  # (B, 3, 3) between the pictures; of no use for the first `posed` pairs
-    view_from_picture: Float64  # (2B, 3, 3), first the a views
-    posed: int  # so many pairs, the first ones, are related by depth and poses
-    size: tuple[int, int]  # width, height of the views
-    whole: bool = False  # the views are the frames as they are
-
-
-class _ByDepth(NamedTuple):
-    """Points of the posed pairs."""
-
-    inverse_depth: Tensor  # (P, N) in picture a, 0 where unknown
-    carried: Carried  # to picture b
 
 
 class DevicePairs:
@@ -83,6 +57,7 @@ class DevicePairs:
         self.store = PictureStore([*frames, *singles], device)
         self.masks = _mask_store([*posed, *pictures.sources], self.store, device)
         self.frames = PosedFrames(posed, device)
+        self.points = PairPoints(self.store, self.frames, self.masks, settings)
         self.first_picture = len(frames) + np.cumsum([0, *(len(source.pictures) for source in pictures.sources)])
         self.pairs = [overlapping_pairs(sequence, settings.pairs) for sequence in posed]
         self.weights = np.array([sequence.weight for sequence in posed])
@@ -116,9 +91,9 @@ class DevicePairs:
             batch = {"images": images, **self.taught(images)}
         batch["scenes"] = on_device(plan.scenes, self.device)
         logits = batch["detector"]
-        points = self._points(plan, logits[: len(plan.rows)].float(), generator)
+        keypoints, points = self.points.related(plan, logits[: len(plan.rows)].float(), generator)
         if settings.pairs.alone:
-            points = self._with_alone(plan, logits.float(), points)
+            points = self.points.with_alone(plan, logits[len(plan.rows) :].float(), keypoints, points)
         return {**batch, **points}
 
     def _taught_of_each(self, images: Tensor) -> dict[str, Tensor]:
@@ -138,18 +113,18 @@ class DevicePairs:
             said["stability"] = self.stability(network_input[:: every or self.settings.stability_every])[0]
         return said
 
-    def _two_whole(self, rng: np.random.Generator, count: int) -> _Plan:
+    def _two_whole(self, rng: np.random.Generator, count: int) -> PairPlan:
         """Two frames each of one recording, as they are but for what is beyond the last whole cell."""
         scene = self._scenes(rng, 1)[0]
         pairs = self.pairs[scene]
         assert pairs is not None
         rows = self.frames.first[scene] + np.array([pairs.draw(rng)[:2] for _ in range(count)], np.int64)
         none = np.tile(np.eye(3), (2 * count, 1, 1))
-        return _Plan(
+        return PairPlan(
             rows, np.full(count, scene), none[:count], none, count, self.whole_frames.size(rows[0, 0]), whole=True
         )
 
-    def _plan(self, rng: np.random.Generator, count: int) -> _Plan:
+    def _plan(self, rng: np.random.Generator, count: int) -> PairPlan:
         """Which pictures are seen, and from where."""
         settings, views = self.settings.pairs, self.settings.views
         share = settings.posed_share if self.sources else 1.0
@@ -174,7 +149,7 @@ class DevicePairs:
         H_a = random_views(rng, views, sizes[:, 0], centres[0])
         self._look_there(H_a, b_from_a, rows, sizes, centres[1], related)
         H_b = random_views(rng, views, sizes[:, 1], centres[1])
-        return _Plan(rows, scenes, b_from_a, np.concatenate([H_a, H_b]), related, (views.width, views.height))
+        return PairPlan(rows, scenes, b_from_a, np.concatenate([H_a, H_b]), related, (views.width, views.height))
 
     def _scenes(self, rng: np.random.Generator, count: int) -> list[int]:
         """Which sequences the pairs are of: every one once before any comes again, or, of different weights, drawn."""
@@ -205,114 +180,6 @@ class DevicePairs:
                 there, rows[pair, 1], b_from_a[pair] = here, rows[pair, 0], np.eye(3)
                 sizes[pair, 1] = sizes[pair, 0]
             centres[pair] = there
-
-    def _points(self, plan: _Plan, logits: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-        """Keypoints of view a and other points, one candidate of either kind a cell, as far as view b shows them."""
-        settings = self.settings.pairs
-        pairs, _, rows, columns = logits.shape
-        keypoints, scores = cell_keypoints(logits)
-        corner = cell_corners(rows, columns, logits.device)
-        shape = (pairs, rows * columns, 2)
-        others = corner + CELL * torch.rand(shape, generator=generator, device=logits.device) - 0.5
-        noise = -torch.log(
-            -torch.log(torch.rand(shape, generator=generator, device=logits.device).clamp(1e-9, 1 - 1e-6))
-        )
-        candidates = torch.cat([keypoints, others], dim=1)
-        carried, visible = self._carry(plan, candidates)
-        points = settings.whole_points if plan.whole else settings.points
-        wanted = round(points * settings.keypoint_share)
-        kept = min(wanted, rows * columns), min(points - wanted, rows * columns)
-        rank = torch.cat([scores + _SPREAD * noise[..., 0], noise[..., 1]], dim=1).masked_fill(~visible, -torch.inf)
-        halves = rank.split(rows * columns, dim=1)
-        chosen = torch.cat(
-            [halves[0].topk(kept[0], dim=1)[1], halves[1].topk(kept[1], dim=1)[1] + rows * columns], dim=1
-        )
-        valid = visible.gather(1, chosen)
-        where = chosen[..., None].expand(-1, -1, 2)
-        points_a = candidates.gather(1, where)
-        points_b = torch.where(valid[..., None], carried.gather(1, where), 0.0)
-        if settings.aligned and plan.posed:
-            points_b, valid = self._by_pictures(plan, points_a, points_b, valid)
-        return {"points_a": points_a, "points_b": points_b, "valid": valid}
-
-    def _with_alone(self, plan: _Plan, logits: Tensor, points: dict[str, Tensor]) -> dict[str, Tensor]:
-        """More rows, which are no correspondences: the best keypoints of either view that the other one does not show.
-
-        They are wrong partners of the others, as in use, where most keypoints of distant frames have no partner.
-        """
-        count = len(plan.rows)
-        a_from_b = np.asarray(np.linalg.inv(plan.b_from_a))
-        views = np.roll(plan.view_from_picture, count, axis=0)
-        turned = replace(plan, rows=plan.rows[:, ::-1], b_from_a=a_from_b, view_from_picture=views)
-        most = min(self.settings.pairs.alone, logits.shape[2] * logits.shape[3])
-        found, known = [], []
-        for one, seen in ((plan, logits[:count]), (turned, logits[count:])):
-            keypoints, scores = cell_keypoints(seen)
-            absent = self._absent(one, keypoints)
-            rank, best = scores.masked_fill(~absent, -torch.inf).topk(most, dim=1)
-            found.append(keypoints.gather(1, best[..., None].expand(-1, -1, 2)))
-            known.append(rank.isfinite())
-        invalid = torch.zeros_like(known[0])
-        return {
-            "points_a": torch.cat([points["points_a"], found[0]], dim=1),
-            "points_b": torch.cat([points["points_b"], found[1]], dim=1),
-            "valid": torch.cat([points["valid"], invalid], dim=1),
-            "negative": torch.cat([points["valid"], known[0]], dim=1),
-            "negative_b": torch.cat([points["valid"], known[1]], dim=1),
-        }
-
-    def _carry(self, plan: _Plan, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels of view b (B, N, 2) of pixels of view a, and whether both pictures show the place."""
-        in_a, in_b, posed = self._in_pictures(plan, points)
-        sizes = on_device(self.store.sizes[plan.rows].astype(np.float32), points.device)
-        visible = within(in_a, sizes[:, 0]) & within(in_b, sizes[:, 1])
-        if posed is not None:
-            shown = self.frames.shown(plan.rows[: plan.posed], posed.carried, self.settings.pairs.depth_tolerance)
-            visible[: plan.posed] &= shown
-        if self.masks is not None:
-            visible = visible & self.masks.used(plan.rows[:, 0], in_a) & self.masks.used(plan.rows[:, 1], in_b)
-        result = warped(plan.view_from_picture[len(plan.rows) :], torch.where(visible[..., None], in_b, 0.0))
-        return result, visible & within(result, on_device(np.array([plan.size], np.float32), points.device))
-
-    def _absent(self, plan: _Plan, points: Tensor) -> Tensor:
-        """Of pixels of view a (B, N, 2), whether it is certain that view b does not show the place."""
-        in_a, in_b, posed = self._in_pictures(plan, points)
-        sizes = on_device(self.store.sizes[plan.rows].astype(np.float32), points.device)
-        known = within(in_a, sizes[:, 0])
-        if posed is not None:
-            known[: plan.posed] &= posed.inverse_depth > 0
-        if self.masks is not None:
-            known = known & self.masks.used(plan.rows[:, 0], in_a)
-        there = warped(plan.view_from_picture[len(plan.rows) :], in_b)
-        size = on_device(np.array([plan.size], np.float32), there.device)
-        margin = self.settings.masked_pixels
-        return known & ~within(there + margin, size + 2 * margin)
-
-    def _in_pictures(self, plan: _Plan, points: Tensor) -> tuple[Tensor, Tensor, _ByDepth | None]:
-        """Pixels of view a in picture a and in picture b (B, N, 2), and what depth says of those of posed pairs."""
-        in_a = warped(np.asarray(np.linalg.inv(plan.view_from_picture[: len(plan.rows)])), points)
-        in_b = warped(plan.b_from_a, in_a)
-        if not plan.posed:
-            return in_a, in_b, None
-        rows = plan.rows[: plan.posed]
-        inverse = self.frames.depths.sample(rows[:, 0], in_a[: plan.posed])
-        carried = self.frames.carry(rows, in_a[: plan.posed], inverse)
-        in_b[: plan.posed] = carried.places
-        return in_a, in_b, _ByDepth(inverse, carried)
-
-    def _by_pictures(self, plan: _Plan, points_a: Tensor, points_b: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """Partners (B, N, 2) of pixels of the a views, and which are known: by depth, and as the pictures have them."""
-        posed = plan.posed
-        rows = plan.rows[:posed]
-        in_a = warped(np.asarray(np.linalg.inv(plan.view_from_picture[:posed])), points_a[:posed])
-        inverse = torch.where(valid[:posed], self.frames.depths.sample(rows[:, 0], in_a), 0.0)
-        found = aligned(self.store, self.frames, rows, in_a, inverse, self.settings.pairs.align)
-        kept = valid[:posed] & ~found.contradicted
-        moved = warped(plan.view_from_picture[len(valid) : len(valid) + posed], found.places)
-        size = on_device(np.array([plan.size], np.float32), moved.device)
-        kept = kept & within(moved, size)
-        points_b = torch.cat([torch.where(kept[..., None], moved, 0.0), points_b[posed:]])
-        return points_b, torch.cat([kept, valid[posed:]])
 
 
 def _mask_store(runs: Sequence[PosedSequence | Source], store: PictureStore, device: torch.device) -> MaskStore | None:

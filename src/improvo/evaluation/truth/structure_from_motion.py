@@ -6,14 +6,18 @@ Everything lies in a working folder, so that what was interrupted goes on: `imag
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from improvo.errors import InputError, imported
+from improvo.errors import InputError, OutputError, imported
 from improvo.evaluation.truth.settings import TruthSettings
 from improvo.files import write_picture
 from improvo.geometry.camera import Camera
@@ -25,6 +29,7 @@ from improvo.types import Float64, Int64
 
 MIN_TRACK = 3  # images that must see a point for its depth to count
 MAX_POINT_ERROR = 2.0  # pixels
+_FEATURE_BYTES = 350  # of a feature in the database, with its matches
 _CHUNK = 8  # images or pairs between two steps of the progress
 
 Progress = Callable[[str, int, int], None]  # stage, done, of how many
@@ -58,9 +63,26 @@ def load_pycolmap() -> Any:
     Raises:
         MissingExtraError: it is not installed.
     """
+    before = signal.getsignal(signal.SIGTERM)
     pycolmap = imported("pycolmap", "structure from motion", "truth")
+    if before is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)  # the import lets SIGTERM print a stack and end the process
     pycolmap.logging.minloglevel = 3  # FATAL: what goes wrong is told by what is missing from the result
     return pycolmap
+
+
+@contextmanager
+def colmap_at(path: Path) -> Iterator[None]:
+    """COLMAP works on this file or folder: what it raises is told in one line.
+
+    Raises:
+        OutputError: it cannot go on, as on a full disk.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:200]
+        raise OutputError(f"{path}: COLMAP cannot go on ({reason}); if the disk is full, free some space") from None
 
 
 def image_pairs(count: int, overlap: int, farthest: int) -> Int64:
@@ -101,19 +123,31 @@ def reconstruct(
             "k1 k2 p1 p2; undistort the images first"
         )
     if not (folder / "model").is_dir():
+        _check_space(folder, len(sequence) * (start.width * start.height + _FEATURE_BYTES * settings.max_features))
         names = _write_images(sequence, folder, progress)
-        _extract(pycolmap, folder, names, start, settings, threads, progress)
-        _match(pycolmap, folder, names, settings, threads, progress)
-        best = _map(pycolmap, folder, len(names), settings, threads, progress)
+        with colmap_at(folder):
+            _extract(pycolmap, folder, names, start, settings, threads, progress)
+            _match(pycolmap, folder, names, settings, threads, progress)
+            best = _map(pycolmap, folder, len(names), settings, threads, progress)
         if best is None:
             raise InputError(f"{sequence.path}: structure from motion found no model; the camera moves too little")
         if settings.calibrate == "full":
             _refine(pycolmap, best, threads)
         unfinished = folder / "model.partial"  # a model appears complete or not at all
         unfinished.mkdir(exist_ok=True)
-        best.write(str(unfinished))
+        with colmap_at(folder):
+            best.write(str(unfinished))
         unfinished.rename(folder / "model")
     return read_reconstruction(folder / "model")
+
+
+def _check_space(folder: Path, needed: int) -> None:
+    """Refuse before any work what would not fit, since a full disk ends COLMAP and the process that it is part of."""
+    needed -= sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        sizes = f"needs about {needed / 1e6:.0f} MB, and {free / 1e6:.0f} MB are free"
+        raise OutputError(f"{folder}: {sizes}; free some space, or choose another folder")
 
 
 def read_reconstruction(folder: Path) -> Reconstruction:

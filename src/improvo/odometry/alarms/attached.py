@@ -18,23 +18,22 @@ from improvo.geometry.a_contrario import SIGNIFICANT, line_probability, log10_fa
 from improvo.geometry.camera import Camera
 from improvo.geometry.epipolar import half_line_distances
 from improvo.geometry.ransac import Ransac, relative_pose
+from improvo.odometry.gates import FAR, FEATURES, LARGE_PART, STEP_FRAMES
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import NO_POINT, Mask, View, common_tracks
 from improvo.tracking.matching import match_units
 from improvo.types import Float64, Int64
 
 _COLUMNS, _ROWS = 16, 12  # cells of the picture
-_FEATURES = 600  # of each view, the strongest within the cells that are attached, or may be, and as many outside
 _MIN_MOVING = 20  # matches that moved; fewer say nothing about the camera
+_MIN_FLOW = 4.0  # times the tolerance: their median motion, before two views are compared
 _MIN_SHARE = 0.5  # of them that agree with it
-_MOVED = 3.0  # times the noise: a match that moved so far did move
-_OFF = 1.5  # times the noise: a match so far from where a point of the world can be is not of it
+_OFF = 1.5  # times the tolerance: a match so far from where a point of the world can be is not of it
+_LONGEST = 30  # frames between two views that are compared
+_MANY = 0.3  # share of the keypoints within such cells; then the frontend is asked for more of the world
 _KEPT = 0.8  # share of the evidence that is left after each comparison
 _ENOUGH = 3.0  # matches against a cell,
 _MOST = 2  # of which one comparison gives so many
-_SHORTEST = 5  # frames between two views that are compared, where enough tracks last; a slow world moves by then
-_LONGEST = 30  # frames between two views that are compared
-_MANY = 0.3  # share of the keypoints within such cells; then the frontend is asked for more of the world
 _PATIENCE = 5  # comparisons in a row that suspect something and find out nothing: a person before a still camera
 
 
@@ -43,16 +42,16 @@ class AttachedDetector:
 
     Args:
         camera: pinhole camera of the views.
-        settings: of the odometry; `attached` and `seed` are used.
+        settings: of the odometry; `attached`, `tolerance` and `seed` are used.
         descriptor_distance: the matching threshold on unit descriptors.
     """
 
     def __init__(self, camera: Camera, settings: OdometrySettings, descriptor_distance: float) -> None:
         self._camera = camera
-        self._settings = settings.attached
+        self._enabled = settings.attached.enabled
         self._seed = settings.seed
         self._descriptor_distance = descriptor_distance
-        self._noise = settings.attached.noise * max(1.0, camera.width / 640.0)
+        self._noise = settings.tolerance * max(1.0, camera.width / 640.0)
         self._anchor: View | None = None
         self._most_moved = 0  # tracks that had moved since the anchor, at most
         self._against, self._for = np.zeros(_ROWS * _COLUMNS), np.zeros(_ROWS * _COLUMNS)
@@ -85,7 +84,7 @@ class AttachedDetector:
             Whether other cells than before are attached now; earlier views can be marked anew with `mark`.
         """
         before = self.cells
-        if self._settings.enabled:
+        if self._enabled:
             self._compare(view)
         self.mark([view])
         return bool((self.cells & ~before).any())
@@ -98,7 +97,7 @@ class AttachedDetector:
             if view.attached.any() and self._anchor is not None and self._anchor is not view:
                 rows, rows_anchor = common_tracks(view, self._anchor)
                 moved = np.linalg.norm(view.keypoints[rows] - self._anchor.keypoints[rows_anchor], axis=1)
-                view.attached[rows[moved > _MOVED * self._noise]] = False
+                view.attached[rows[moved > FAR * self._noise]] = False
 
     def drop(self, views: Sequence[View]) -> float:
         """Mark views anew, and drop what their marked keypoints observe; returns its share of all observations."""
@@ -122,12 +121,12 @@ class AttachedDetector:
             few_left = (view.tracks <= anchor.tracks.max(initial=-1)).sum() < 2 * _MIN_MOVING
             rows, rows_anchor = common_tracks(view, anchor)
             motion = np.linalg.norm(view.keypoints[rows] - anchor.keypoints[rows_anchor], axis=1)
-            moved = motion[motion > _MOVED * self._noise]
+            moved = motion[motion > FAR * self._noise]
             self._most_moved = max(self._most_moved, len(moved))
-            slow = len(moved) < _MIN_MOVING or np.median(moved) < self._settings.min_flow * self._noise
+            slow = len(moved) < _MIN_MOVING or np.median(moved) < _MIN_FLOW * self._noise
             # tracks of the world end, while a logo's stay
             ending = self._most_moved >= _MIN_MOVING and len(moved) < 0.5 * self._most_moved
-            if not few_left and ((slow and not ending) or view.frame_index - anchor.frame_index < _SHORTEST):
+            if not few_left and ((slow and not ending) or view.frame_index - anchor.frame_index < STEP_FRAMES):
                 return
             self._weigh(anchor, view)
         self._anchor, self._most_moved = view, 0
@@ -139,7 +138,7 @@ class AttachedDetector:
         before, now = anchor.keypoints[rows_before[matches[:, 0]]], view.keypoints[rows_now[matches[:, 1]]]
         cells = self._cell(now)
         motion = np.linalg.norm(now - before, axis=1)
-        still, moved = motion <= self._noise, np.flatnonzero(motion > _MOVED * self._noise)
+        still, moved = motion <= self._noise, np.flatnonzero(motion > FAR * self._noise)
         if len(moved) < _MIN_MOVING or not self._enough_moves(cells[still], cells[moved]):
             self._suspect(cells[still], cells[moved])
             return
@@ -162,7 +161,7 @@ class AttachedDetector:
     def _strongest(self, view: View) -> Int64:
         """Rows of a view's keypoints; of the world as many as if nothing were attached."""
         apart = (self.cells | self._suspected)[self._cell(view.keypoints)]
-        parts = [np.flatnonzero(part)[:_FEATURES] for part in (apart, ~apart)]
+        parts = [np.flatnonzero(part)[:FEATURES] for part in (apart, ~apart)]
         return np.sort(np.concatenate(parts)) if apart.any() else parts[1]
 
     def _enough_moves(self, still: Int64, moved: Int64) -> bool:
@@ -173,7 +172,7 @@ class AttachedDetector:
         """
         occupied = len(np.unique(still)), len(np.unique(moved))
         whole = self._suspected.size if self._suspected.any() else sum(occupied)
-        return occupied[1] >= self._settings.min_moving_cells * whole
+        return occupied[1] >= LARGE_PART * whole
 
     def _suspect(self, still: Int64, moved: Int64) -> None:
         """Nothing can be concluded: the frontend may have spent its keypoints on what stands."""

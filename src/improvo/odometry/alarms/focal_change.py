@@ -14,15 +14,12 @@ import numpy as np
 
 from improvo.geometry.camera import Camera
 from improvo.geometry.ransac import Ransac, absolute_pose
+from improvo.odometry.gates import FEWEST
 from improvo.odometry.view import View, common_tracks
 from improvo.types import Float64
 
-_LEAST = np.log(1.08)  # change of the distances in one frame; a step ahead rarely changes them by more
-_MIN_POINTS = 20  # of the map, in both views
-_BETTER = 1.25  # times as many points must fit with the other focal length,
-_MORE = 8  # and so many more
-_SAME_LENS = 0.05  # relative difference from the camera as given that is none
-_TOLERANCE = 0.5  # times the map's own largest error, since a zoom is told by what lies close
+_SAME_LENS = np.log(1.08)  # change of the focal length that is none; a step ahead rarely changes distances by more
+_BETTER = 1.25  # times as many points must fit with the other focal length
 
 
 class LensWatch:
@@ -30,12 +27,12 @@ class LensWatch:
 
     Args:
         camera: as it is given.
-        max_error: pixels, largest error of an observation of the map.
+        tolerance: pixels; the map allows twice that, but a zoom is told by what lies close.
         seed: of the RANSAC.
     """
 
-    def __init__(self, camera: Camera, max_error: float, seed: int) -> None:
-        self._camera, self._max_error, self._seed = camera, max_error, seed
+    def __init__(self, camera: Camera, tolerance: float, seed: int) -> None:
+        self._camera, self._tolerance, self._seed = camera, tolerance, seed
         self.factor = 1.0  # of the focal length now, times that of the camera as given
 
     def changed(self, before: View, view: View, xyz: Float64) -> bool:
@@ -48,16 +45,16 @@ class LensWatch:
         """
         if before.frame_index != view.frame_index - 1:
             return False
-        change = focal_change(before, view, xyz, self._camera, self._max_error, self._seed)
+        change = focal_change(before, view, xyz, self._camera, self._tolerance, self._seed)
         if change == 1.0:
             return False
         self.factor *= change
-        if abs(self.factor - 1.0) < _SAME_LENS:
+        if abs(np.log(self.factor)) < _SAME_LENS:
             self.factor = 1.0
         return True
 
 
-def focal_change(before: View, view: View, xyz: Float64, camera: Camera, max_error: float, seed: int) -> float:
+def focal_change(before: View, view: View, xyz: Float64, camera: Camera, tolerance: float, seed: int) -> float:
     """By which factor the focal length changed between two consecutive views; 1 where it did not.
 
     Args:
@@ -65,22 +62,22 @@ def focal_change(before: View, view: View, xyz: Float64, camera: Camera, max_err
         view: the next one, without a pose yet.
         xyz: (P, 3) points of the map.
         camera: as it is given, of both.
-        max_error: pixels, largest error of an observation of the map.
+        tolerance: pixels; the map allows twice that, but a zoom is told by what lies close.
         seed: of the RANSAC.
     """
     rows, rows_before = common_tracks(view, before)
     known = before.points[rows_before] >= 0
     rows, rows_before = rows[known], rows_before[known]
-    if len(rows) < _MIN_POINTS:
+    if len(rows) < 2 * FEWEST:
         return 1.0
     factor = _scale(before.keypoints[rows_before], view.keypoints[rows])
-    if abs(np.log(factor)) < _LEAST:
+    if abs(np.log(factor)) < _SAME_LENS:
         return 1.0
     points, pixels = xyz[before.points[rows_before]], view.keypoints[rows]
-    ransac = Ransac(_TOLERANCE * max_error, seed, min_iterations=100, max_iterations=1000)
+    ransac = Ransac(tolerance, seed, min_iterations=100, max_iterations=1000)
     zoomed = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
     as_given, changed = (int(absolute_pose(points, pixels, each, ransac).inliers.sum()) for each in (camera, zoomed))
-    return factor if changed >= max(_BETTER * as_given, as_given + _MORE) else 1.0
+    return factor if changed >= max(_BETTER * as_given, as_given + FEWEST) else 1.0
 
 
 def _scale(before: Float64, now: Float64) -> float:

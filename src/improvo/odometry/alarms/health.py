@@ -18,12 +18,15 @@ from improvo.geometry.camera import Camera
 from improvo.geometry.epipolar import sampson_errors
 from improvo.geometry.ransac import Ransac, relative_pose
 from improvo.odometry.alarms.two_motions import holds_beside
+from improvo.odometry.gates import FEATURES, LARGE_PART, SAME_TURN_DEG, STEP_FRAMES
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View, ransac_pairs
 from improvo.tracking.matching import match_units
 from improvo.types import Int64
 
-_FEATURES = 600  # of each view, the strongest; more cost time and change nothing
+_GAPS = (3, 6, 12)  # frames between the two views of a check
+_ROUNDS = 3  # consecutive checks that are evaluated together
+_AGREEMENT = 0.85  # share of the two views' own inliers that fit the map: right maps stay over 0.90, wrong under 0.80
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class HealthCheck:
 
     Args:
         camera: pinhole camera of the views.
-        settings: of the odometry; `health`, `ransac_gate`, `start` and `seed` are used.
+        settings: of the odometry; `ransac_gate`, `start`, `tolerance` and `seed` are used.
         descriptor_distance: the matching threshold on unit descriptors.
     """
 
@@ -53,7 +56,7 @@ class HealthCheck:
         self._camera = camera
         self._settings = settings
         self._descriptor_distance = descriptor_distance
-        self._rounds: deque[Int64] = deque(maxlen=settings.health.rounds)  # of (gaps, 2) map and own inliers
+        self._rounds: deque[Int64] = deque(maxlen=_ROUNDS)  # of (gaps, 2) map and own inliers
         self._two_motions = 0  # checks in a row that saw two
 
     def contradicts(self, view: View, earlier: Mapping[int, View]) -> bool:
@@ -63,35 +66,32 @@ class HealthCheck:
             view: the newest view with a pose.
             earlier: recent views with poses by frame index.
         """
-        settings = self._settings.health
-        if view.frame_index % settings.interval:
+        if view.frame_index % STEP_FRAMES:
             return False
-        counts = np.zeros((len(settings.gaps), 2), np.int64)
+        counts = np.zeros((len(_GAPS), 2), np.int64)
         two_motions = False
-        for row, gap in enumerate(settings.gaps):
+        for row, gap in enumerate(_GAPS):
             if view.frame_index - gap not in earlier:
                 continue
             found = agreement(
                 earlier[view.frame_index - gap], view, self._camera, self._descriptor_distance, self._settings
             )
             two_motions |= found.two_motions
-            enough = found.own_inliers >= max(
-                self._settings.start.min_points, settings.min_inlier_share * found.matches
-            )
-            if enough and found.turn_deg < settings.max_turn_deg and not found.two_motions:
+            enough = found.own_inliers >= max(self._settings.start.min_points, LARGE_PART * found.matches)
+            if enough and found.turn_deg < SAME_TURN_DEG and not found.two_motions:
                 counts[row] = found.map_inliers, found.own_inliers
         self._rounds.append(counts)
         self._two_motions = self._two_motions + 1 if two_motions else 0
-        if len(self._rounds) < settings.rounds:
+        if len(self._rounds) < _ROUNDS:
             return False
         map_inliers, own_inliers = np.sum(self._rounds, axis=(0, 1))
-        decides = own_inliers >= settings.min_evidence
-        return bool(decides and map_inliers < settings.min_agreement * own_inliers)
+        decides = own_inliers >= _ROUNDS * self._settings.start.min_points
+        return bool(decides and map_inliers < _AGREEMENT * own_inliers)
 
     @property
     def ambiguous(self) -> bool:
         """Whether the last checks saw another motion beside the map's, so that one of both is not the camera's."""
-        return self._two_motions >= self._settings.health.rounds - 1
+        return self._two_motions >= _ROUNDS - 1
 
 
 def agreement(a: View, b: View, camera: Camera, descriptor_distance: float, settings: OdometrySettings) -> Agreement:
@@ -109,14 +109,14 @@ def agreement(a: View, b: View, camera: Camera, descriptor_distance: float, sett
     """
     assert a.cam_from_world is not None
     assert b.cam_from_world is not None
-    rows_a, rows_b = (np.flatnonzero(~view.attached)[:_FEATURES] for view in (a, b))
+    rows_a, rows_b = (np.flatnonzero(~view.attached)[:FEATURES] for view in (a, b))
     matches = match_units(a.descriptors[rows_a], b.descriptors[rows_b], descriptor_distance)
     matches = np.stack([rows_a[matches[:, 0]], rows_b[matches[:, 1]]], axis=1)
     if len(matches) < 8:
         return Agreement(0, 0, len(matches))
     pixels_a, pixels_b = a.keypoints[matches[:, 0]], b.keypoints[matches[:, 1]]
-    used = ransac_pairs(a, b, matches, settings.ransac_gate)
-    limit = settings.health.epipolar_error
+    used = ransac_pairs(a, b, matches, settings)
+    limit = settings.tolerance
     ransac = Ransac(limit, settings.seed, min_iterations=100, max_iterations=1000)
     own = relative_pose(pixels_a[used], pixels_b[used], camera, ransac)
     of_map = b.cam_from_world @ se3.inverse(a.cam_from_world)

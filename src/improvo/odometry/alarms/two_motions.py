@@ -13,9 +13,9 @@ from improvo.geometry.a_contrario import SIGNIFICANT, line_probability, log10_fa
 from improvo.geometry.camera import Camera
 from improvo.geometry.epipolar import sampson_errors
 from improvo.geometry.ransac import Ransac, relative_pose
+from improvo.odometry.gates import FAR
 from improvo.types import Float64, Int64
 
-_FAR = 3.0  # times the tolerance: a match so far off the first motion is none of its own noise
 _LEAST_SPREAD = 0.3  # cells of the picture that the one has, as a share of those of the other
 _COLUMNS, _ROWS = 8, 6  # cells of the picture
 
@@ -34,7 +34,7 @@ def has_second_motion(
         least_spread: cells of the picture that the second motion has, as a share of those of the first.
     """
     errors = sampson_errors(first, camera, pixels_a, pixels_b)
-    off = np.flatnonzero(errors > _FAR * ransac.max_error)
+    off = np.flatnonzero(errors > FAR * ransac.max_error)
     if len(off) < 8:
         return False
     second = relative_pose(pixels_a[off], pixels_b[off], camera, ransac)
@@ -58,7 +58,7 @@ def holds_beside(errors: Float64, errors_other: Float64, pixels: Float64, camera
     chance = line_probability(camera.width, camera.height, tolerance)
     cells = []
     for own, other in ((errors, errors_other), (errors_other, errors)):
-        off = other > _FAR * tolerance
+        off = other > FAR * tolerance
         supporting = off & (own <= tolerance)
         if log10_false_alarms(int(off.sum()), int(supporting.sum()), chance, sample=0) > SIGNIFICANT:
             return False

@@ -12,15 +12,13 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.alignment import Similarity
+from improvo.odometry.gates import SAME_SCALE, SAME_TURN_DEG
 from improvo.odometry.mapping.former_map import FormerMap, Sighting
-from improvo.odometry.settings import BridgingSettings
+from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
 from improvo.types import Float64
 
 _FORMER_MAPS = 2  # kept; the camera seldom returns to an older place within so few frames
-_LARGEST_DISTANCE = 0.05  # between the places of a camera by two sightings, as a share of its distance to the points
-_LARGEST_ANGLE_DEG = 3.0
-_LARGEST_SCALE_CHANGE = 0.1  # of the logarithm, besides three standard errors
 
 
 @dataclass(frozen=True)
@@ -37,11 +35,12 @@ class Bridging:
     """Looks for the former maps in the views of a new one.
 
     Args:
-        settings: how long, and how sure.
+        settings: of the odometry; `bridging` says how long, and `verdict.max_error` how sure.
     """
 
-    def __init__(self, settings: BridgingSettings) -> None:
-        self._settings = settings
+    def __init__(self, settings: OdometrySettings) -> None:
+        self._max_frames = settings.bridging.max_frames
+        self._max_error = settings.verdict.max_error / 100.0  # of the scale, and of places as a share of their distance
         self._former: list[FormerMap] = []
         self._sightings: dict[int, list[Sighting]] = {}  # by row of the former map
         self._found = False  # in which the running map lies
@@ -64,7 +63,7 @@ class Bridging:
         """
         if self._found:
             return None
-        oldest = view.frame_index - self._settings.max_frames
+        oldest = view.frame_index - self._max_frames
         for row, former in enumerate(self._former):
             if former.last_frame < oldest:
                 continue
@@ -72,24 +71,24 @@ class Bridging:
             if sighting is None:
                 continue
             for other in self._sightings.get(row, []):
-                join = _joined(former, other, sighting)
-                if join is not None and join.scale_error <= self._settings.max_scale_error:
+                join = _joined(former, other, sighting, self._max_error)
+                if join is not None and join.scale_error <= self._max_error:
                     self._found = True
                     return join
             self._sightings.setdefault(row, []).append(sighting)
         return None
 
 
-def _joined(former: FormerMap, a: Sighting, b: Sighting) -> Join | None:
+def _joined(former: FormerMap, a: Sighting, b: Sighting, max_error: float) -> Join | None:
     """Both sightings as one; None where they contradict each other."""
     errors = np.maximum([a.scale_error, b.scale_error], 1e-4)
     logs = np.log([a.former_from_new.scale, b.former_from_new.scale])
     change = float(abs(logs[1] - logs[0]))
-    if change > _LARGEST_SCALE_CHANGE + 3.0 * float(np.hypot(*errors)):
+    if change > SAME_SCALE + 3.0 * float(np.hypot(*errors)):
         return None
     angle = se3.rotation_angle_deg(a.former_from_new.rotation.T @ b.former_from_new.rotation)
     distance = np.linalg.norm(a.former_from_new.apply(b.center) - b.former_pose[:3, 3])
-    if float(angle) > _LARGEST_ANGLE_DEG or distance > _LARGEST_DISTANCE * b.depth:
+    if float(angle) > SAME_TURN_DEG or distance > max_error * b.depth:
         return None
     log_scale = float(np.average(logs, weights=errors**-2.0))
     better = a if a.inliers >= b.inliers else b

@@ -12,12 +12,12 @@ from improvo.geometry.a_contrario import SIGNIFICANT, disc_probability, log10_fa
 from improvo.geometry.alignment import Similarity
 from improvo.geometry.camera import Camera
 from improvo.geometry.ransac import Ransac, absolute_pose
+from improvo.odometry.gates import FEWEST
 from improvo.odometry.view import View
 from improvo.tracking.matching import match_units
 from improvo.types import Float32, Float64, Int64
 
 _MOST_POINTS = 4000  # the newest; more cost time
-_LEAST_SHARED = 10  # points of both maps that carry the scale
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class FormerMap:
         """
         assert view.cam_from_world is not None
         matches = match_units(self._descriptors, view.descriptors, self._descriptor_distance)
-        if len(matches) < _LEAST_SHARED:
+        if len(matches) < FEWEST:
             return None
         former, rows = matches.T
         found = absolute_pose(self._xyz[former], view.keypoints[rows], self._camera, self._ransac)
@@ -95,12 +95,12 @@ class FormerMap:
         if log10_false_alarms(len(matches), inliers, chance, sample=3, models=4) > SIGNIFICANT:  # P3P
             return None
         both = found.inliers & (view.points[rows] >= 0)
-        if both.sum() < _LEAST_SHARED:
+        if both.sum() < FEWEST:
             return None
         in_former = se3.transform(found.pose, self._xyz[former[both]])[:, 2]
         in_new = se3.transform(view.cam_from_world, xyz[view.points[rows[both]]])[:, 2]
         front = (in_former > 0) & (in_new > 0)
-        if front.sum() < _LEAST_SHARED:
+        if front.sum() < FEWEST:
             return None
         logs = np.log(in_former[front] / in_new[front])
         log_scale = float(np.median(logs))

@@ -11,12 +11,18 @@ from improvo.geometry.epipolar import rotation_residuals
 from improvo.geometry.ransac import Ransac, RobustHomography, homography, motions_of_homography, relative_pose
 from improvo.geometry.triangulation import triangulate_tracks
 from improvo.odometry.alarms.two_motions import has_second_motion
-from improvo.odometry.settings import OdometrySettings, StartSettings
+from improvo.odometry.gates import MIN_PARALLAX_DEG, gate
+from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View, matches_of_world, ransac_pairs
 from improvo.tracking.matching import match_units
 from improvo.types import Float64, Int64
 
-_UNIQUE_SHARE = 0.75  # a second motion over a plane with more of the first one's points leaves the choice open
+_STRICT = 2.0 / 3.0  # of the tolerance, since two views have nothing else to be right by
+_MIN_INLIER_SHARE = 0.3  # essential inliers of the matches
+# Homography inliers over essential inliers: with more the scene is one plane, unless twice min_points are off it. And
+# points of a second motion over a plane, over those of the first: with more the choice between them is open.
+_MOSTLY = 0.75
+_MAX_SECOND_MOTION = 0.5  # spread over the picture of another motion, as a share of the first one's
 
 
 @dataclass(frozen=True)
@@ -51,37 +57,35 @@ def initial_pair(
         a: the earlier view.
         b: the later view.
         camera: pinhole, of both.
-        settings: of the odometry; `start` and `ransac_gate` are used.
+        settings: of the odometry; `start`, `ransac_gate` and `tolerance` are used.
         descriptor_distance: the matching threshold on unit descriptors.
     """
-    start = settings.start
+    least, strict = settings.start.min_points, _STRICT * settings.tolerance
     matches = matches_of_world(a, b, match_units(a.descriptors, b.descriptors, descriptor_distance))
-    rows_a, rows_b = matches[ransac_pairs(a, b, matches, settings.ransac_gate)].T
-    if len(rows_a) < 2 * start.min_points:
+    rows_a, rows_b = matches[ransac_pairs(a, b, matches, settings)].T
+    if len(rows_a) < 2 * least:
         return InitFailure("too few matches")
     pixels_a, pixels_b = a.keypoints[rows_a], b.keypoints[rows_b]
-    ransac = Ransac(start.epipolar_error, settings.seed, min_iterations=200, max_iterations=5000)
+    ransac = Ransac(strict, settings.seed, min_iterations=200, max_iterations=5000)
     essential = relative_pose(pixels_a, pixels_b, camera, ransac)
     plane = homography(pixels_a, pixels_b, ransac)
     inliers = essential.inliers
-    if inliers.sum() < max(start.min_inlier_share * len(rows_a), start.min_points):
+    if inliers.sum() < max(_MIN_INLIER_SHARE * len(rows_a), least):
         return InitFailure("too few matches agree on a motion")
-    if np.median(rotation_residuals(camera, pixels_a[inliers], pixels_b[inliers])) < start.min_rotation_residual:
+    if np.median(rotation_residuals(camera, pixels_a[inliers], pixels_b[inliers])) < gate(strict):
         return InitFailure("too little parallax: a rotation explains the motion")
     another = replace(ransac, max_iterations=1000)
-    if has_second_motion(essential.pose, camera, pixels_a, pixels_b, another, start.max_second_motion):
+    if has_second_motion(essential.pose, camera, pixels_a, pixels_b, another, _MAX_SECOND_MOTION):
         return InitFailure("two motions: one of them is not the camera's")
     ratio = plane.inliers.sum() / max(inliers.sum(), 1)
     off_plane = (inliers & ~plane.inliers).sum()
-    if ratio > start.max_homography_ratio and off_plane < 2 * start.min_points:
-        if ratio < start.plane_ratio:
-            return InitFailure("too little parallax")
-        return _from_plane(a, b, rows_a, rows_b, plane, camera, start)
-    return _with_points(a, b, rows_a[inliers], rows_b[inliers], essential.pose, camera, start)
+    if ratio > _MOSTLY and off_plane < 2 * least:
+        return _from_plane(a, b, rows_a, rows_b, plane, camera, settings)
+    return _with_points(a, b, rows_a[inliers], rows_b[inliers], essential.pose, camera, settings)
 
 
 def _with_points(
-    a: View, b: View, rows_a: Int64, rows_b: Int64, b_from_a: Float64, camera: Camera, settings: StartSettings
+    a: View, b: View, rows_a: Int64, rows_b: Int64, b_from_a: Float64, camera: Camera, settings: OdometrySettings
 ) -> InitialPair | InitFailure:
     """Triangulate the matches; a failure if too few have parallax."""
     count = len(rows_a)
@@ -91,16 +95,14 @@ def _with_points(
     result = triangulate_tracks(keypoints, np.tile([0, 1], count), offsets, poses, camera.K)
     worst = result.errors.reshape(-1, 2).max(axis=1)
     parallax_deg = result.parallax_deg
-    good = (
-        result.in_front & (worst <= 2.0 * settings.epipolar_error) & (parallax_deg > 0.25 * settings.min_parallax_deg)
-    )
-    if (parallax_deg[good] >= settings.min_parallax_deg).sum() < settings.min_points:
+    good = result.in_front & (worst <= gate(_STRICT * settings.tolerance)) & (parallax_deg > 0.25 * MIN_PARALLAX_DEG)
+    if (parallax_deg[good] >= MIN_PARALLAX_DEG).sum() < settings.start.min_points:
         return InitFailure("too little parallax")
     return InitialPair(b_from_a, rows_a[good], rows_b[good], result.points[good], parallax_deg[good])
 
 
 def _from_plane(
-    a: View, b: View, rows_a: Int64, rows_b: Int64, plane: RobustHomography, camera: Camera, settings: StartSettings
+    a: View, b: View, rows_a: Int64, rows_b: Int64, plane: RobustHomography, camera: Camera, settings: OdometrySettings
 ) -> InitialPair | InitFailure:
     """The motion over a plane that puts most points in front of both cameras, if no other comes near it."""
     rows_a, rows_b = rows_a[plane.inliers], rows_b[plane.inliers]
@@ -109,6 +111,6 @@ def _from_plane(
     pairs = sorted((pair for pair in tried if isinstance(pair, InitialPair)), key=lambda pair: -len(pair.rows_a))
     if not pairs:
         return InitFailure("too little parallax")
-    if len(pairs) > 1 and len(pairs[1].rows_a) > _UNIQUE_SHARE * len(pairs[0].rows_a):
+    if len(pairs) > 1 and len(pairs[1].rows_a) > _MOSTLY * len(pairs[0].rows_a):
         return InitFailure("a plane with two possible motions")
     return pairs[0]

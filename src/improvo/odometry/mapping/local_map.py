@@ -11,6 +11,7 @@ from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.geometry.ransac import Ransac, absolute_pose
 from improvo.geometry.triangulation import triangulate_tracks
+from improvo.odometry.gates import FEWEST, MEMORY_FRAMES, MIN_PARALLAX_DEG, gate
 from improvo.odometry.mapping.projection_search import match_by_projection
 from improvo.odometry.refinement.keypoint_refinement import KeypointRefiner
 from improvo.odometry.settings import OdometrySettings
@@ -18,6 +19,8 @@ from improvo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_poin
 from improvo.tracking.matching import match_units
 from improvo.types import Float32, Float64, Int64
 
+_WRONG_SHARE = 0.1  # of wrong matches that agree with a wrong pose, where the scene repeats or is mirrored
+_SEARCH = 8.0 / 640.0  # of the picture's width, between a map point's projection and its keypoint
 _FASTER = 5.0  # times the fastest step before a loss: the camera cannot be farther off where it is found again,
 _FAST = 0.1  # unless it is within this share of the distance to what it sees, for each frame
 _SAME_SIDE = 0.5  # cosine of the angle between two rays to a point; features are not matched over 60 degrees
@@ -35,11 +38,12 @@ class LocalMap:
     def __init__(self, camera: Camera, settings: OdometrySettings, descriptor_distance: float) -> None:
         self.camera = camera
         self.store = PointStore()
-        self.history: deque[View] = deque(maxlen=settings.matching.search_frames)  # in order of processing
+        self.history: deque[View] = deque(maxlen=MEMORY_FRAMES)  # in order of processing
         self._settings = settings
         self._descriptor_distance = descriptor_distance
-        self.refiner = KeypointRefiner(camera, settings.refinement, settings.matching.search_frames)
-        self._search_radius = max(3.0, settings.matching.search_radius * camera.width / 640.0)
+        self.refiner = KeypointRefiner(camera, settings.tolerance)
+        self._max_error = gate(settings.tolerance)  # pixels, of an observation
+        self._search_radius = max(self._max_error, _SEARCH * camera.width)
 
     def remember(self, view: View) -> None:
         """The view is processed: its points were seen last in it."""
@@ -80,9 +84,8 @@ class LocalMap:
         return inliers, share
 
     def _is_lost(self, inliers: int, share: float) -> bool:
-        loss = self._settings.loss
         outliers = inliers / share - inliers if share > 0 else 0.0
-        return inliers < loss.min_inliers + loss.wrong_share * outliers
+        return inliers < FEWEST + _WRONG_SHARE * outliers
 
     def _from_same_side(self, view: View, other: View) -> bool:
         """Whether a view sees its points from where another one, with a pose, can have seen the same of them.
@@ -129,9 +132,8 @@ class LocalMap:
         rows = view.observed
         if len(rows) < 4:
             return 0, 0.0
-        max_error = self._settings.window.max_error
-        used = ransac_rows(view.weights[rows], self._settings.ransac_gate)
-        ransac = Ransac(max_error, self._settings.seed, min_iterations=100, max_iterations=2000)
+        used = ransac_rows(view.weights[rows], self._settings)
+        ransac = Ransac(self._max_error, self._settings.seed, min_iterations=100, max_iterations=2000)
         points = self.store.xyz[view.points[rows[used]]]
         found = absolute_pose(points, view.keypoints[rows[used]], self.camera, ransac)
         inliers = found.inliers
@@ -141,7 +143,7 @@ class LocalMap:
         if not used.all():
             doubtful = rows[~used]
             pixels, visible = self.project(view.cam_from_world, self.store.xyz[view.points[doubtful]])
-            fits[~used] = visible & (np.linalg.norm(pixels - view.keypoints[doubtful], axis=1) <= max_error)
+            fits[~used] = visible & (np.linalg.norm(pixels - view.keypoints[doubtful], axis=1) <= self._max_error)
         view.points[rows[~fits]] = NO_POINT
         return int(inliers.sum()), float(inliers.mean())
 
@@ -209,12 +211,7 @@ class LocalMap:
         result = triangulate_tracks(keypoints, camera.astype(np.int64), offsets, poses, self.camera.K)
         counts = np.diff(offsets)
         worst = np.maximum.reduceat(result.errors, offsets[:-1]) if len(track) else np.zeros(0)
-        good = (
-            result.in_front
-            & (counts >= 2)
-            & (result.parallax_deg >= self._settings.start.min_parallax_deg)
-            & (worst <= self._settings.window.max_error)
-        )
+        good = result.in_front & (counts >= 2) & (result.parallax_deg >= MIN_PARALLAX_DEG) & (worst <= self._max_error)
         ids = np.full(len(counts), NO_POINT)
         ids[good] = self.store.add(result.points[good], view.frame_index)
         point = np.repeat(ids, counts)

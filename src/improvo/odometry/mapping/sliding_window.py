@@ -7,9 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from improvo.geometry import se3
+from improvo.odometry.gates import LARGE_PART
 from improvo.odometry.settings import WindowSettings
 from improvo.odometry.view import View, common_tracks
 from improvo.types import Float64
+
+_KEYFRAME_MOTION = 0.05  # median motion since the last keyframe, as a share of the picture's width
 
 
 class SlidingWindow:
@@ -65,8 +68,8 @@ class SlidingWindow:
             shared_points = np.isin(last.points[last.observed], view.points[view.observed])
             world = ~view.attached[rows]
             moved = np.linalg.norm(view.keypoints[rows[world]] - last.keypoints[rows_last[world]], axis=1)
-            few_shared = len(shared_points) == 0 or shared_points.mean() < settings.keyframe_shared
-            far = len(moved) == 0 or np.median(moved) > settings.keyframe_motion * self._image_width
+            few_shared = len(shared_points) == 0 or shared_points.mean() < 1.0 - LARGE_PART
+            far = len(moved) == 0 or np.median(moved) > _KEYFRAME_MOTION * self._image_width
             long_ago = view.frame_index - last.frame_index >= settings.recent
             if not (few_shared or far or long_ago):
                 return

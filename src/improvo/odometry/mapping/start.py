@@ -9,13 +9,14 @@ import numpy as np
 from improvo.backend.settings import SolverSettings
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
+from improvo.odometry.gates import gate
 from improvo.odometry.mapping.initial_pair import InitFailure, InitialPair, initial_pair
 from improvo.odometry.mapping.local_map import LocalMap
-from improvo.odometry.mapping.window import adjust
+from improvo.odometry.mapping.window import OBJECTIVE, SOLVER, adjust
 from improvo.odometry.settings import OdometrySettings, WindowSettings
 from improvo.odometry.view import View, common_tracks
 
-_SOLVER = SolverSettings(max_iterations=30, relative_decrease=1e-4)  # of the first pair, and of all views at the end
+_PATIENT = SolverSettings(max_iterations=30, relative_decrease=1e-4)  # of the first pair, and of all views at the end
 
 
 def start_map(
@@ -64,12 +65,13 @@ def _grow(
     buffer: Sequence[View], a: View, b: View, pair: InitialPair, local_map: LocalMap, settings: OdometrySettings
 ) -> InitFailure | None:
     """Two views, then all others backwards, then all together."""
-    K, store, start, window = local_map.camera.K, local_map.store, settings.start, settings.window
+    K, store, window = local_map.camera.K, local_map.store, settings.window
+    max_error = gate(settings.tolerance)
     ids = store.add(pair.xyz, b.frame_index)
     a.cam_from_world, b.cam_from_world = np.eye(4), pair.b_from_a
     a.points[pair.rows_a], b.points[pair.rows_b] = ids, ids
-    report = adjust([b], [a], store, K, settings.objective, _SOLVER, window.max_error)
-    if report.mean_error > start.max_mean_error or report.kept < 2 * start.min_points:
+    report = adjust([b], [a], store, K, OBJECTIVE, _PATIENT, max_error)
+    if report.mean_error > settings.tolerance or report.kept < 2 * settings.start.min_points:
         return InitFailure("the first two views do not fit")
     local_map.refiner.refine([(a, a.observed), (b, b.observed)], store)
     local_map.remember(a)
@@ -81,7 +83,7 @@ def _grow(
             local_map.localise(view, neighbour)
             if view.cam_from_world is None:
                 missed += 1
-                if missed <= start.max_lost:
+                if missed <= settings.loss.max_lost_frames:
                     continue
                 if view.frame_index > a.frame_index:
                     return InitFailure("the first views do not fit together", costly=True)
@@ -91,12 +93,12 @@ def _grow(
         others = done[-(window.recent + 1) : -1]
         local_map.triangulate(view, others if view is a or a in others else [*others, a])
         free, fixed = _free_and_fixed(done, a, window)
-        adjust(free, fixed, store, K, settings.objective, settings.solver, window.max_error)
+        adjust(free, fixed, store, K, OBJECTIVE, SOLVER, max_error)
         local_map.remember(view)
         neighbour = view
     first, *rest = sorted(done, key=lambda view: view.frame_index)
-    report = adjust(rest, [first], store, K, settings.objective, _SOLVER, window.max_error)
-    if not report.mean_error <= start.max_mean_error:
+    report = adjust(rest, [first], store, K, OBJECTIVE, _PATIENT, max_error)
+    if not report.mean_error <= settings.tolerance:
         return InitFailure("the first views do not fit together", costly=True)
     return None
 

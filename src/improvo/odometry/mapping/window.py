@@ -13,6 +13,8 @@ from improvo.backend.solver import solve
 from improvo.odometry.view import NO_POINT, Mask, PointStore, View
 from improvo.types import Float64, Int64
 
+OBJECTIVE = ObjectiveSettings(depth_weight=0.0)  # the paper's, without the regulariser, which is wrong outdoors
+SOLVER = SolverSettings(max_iterations=8, relative_decrease=1e-3)  # the next frame's solve goes on from there
 _WORTH_SOLVING_AGAIN = 0.01  # share of observations dropped; where fewer were, the next frame's solve is enough
 
 

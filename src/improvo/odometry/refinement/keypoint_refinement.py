@@ -15,13 +15,17 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
+from improvo.odometry.gates import MEMORY_FRAMES, gate
 from improvo.odometry.refinement.anchors import Anchors
 from improvo.odometry.refinement.patch_alignment import align, cut_patches, repeated, warps_between
-from improvo.odometry.settings import RefinementSettings
 from improvo.odometry.view import PointStore, View
 from improvo.types import Float64, Int64, UInt8
 
 _FORGET_EVERY = 10  # frames
+_MAX_MOVE = 4.0 / 3.0  # times the tolerance, from the detected keypoint; one that would go farther stays
+_MIN_CORRELATION = 0.8  # of the grey values of both patches
+_MAX_DEVIATION = 0.3  # pixels, expected error of the new place
+_MAX_AREA_RATIO = 2.5  # between two pictures; beyond it the patch is taken anew from the newer one
 _BLUR = 0.8  # pixels: sampling between pixels blurs unevenly, unless the picture is a little blurred before
 
 
@@ -36,15 +40,13 @@ class KeypointRefiner:
 
     Args:
         camera: pinhole, of all views.
-        settings: when a place is good enough.
-        search_frames: frames for which a point that is not observed may still come back.
+        tolerance: pixels; the search begins within twice that.
     """
 
-    def __init__(self, camera: Camera, settings: RefinementSettings, search_frames: int) -> None:
+    def __init__(self, camera: Camera, tolerance: float) -> None:
         self._camera = camera
         self._focal = np.array([camera.fx, camera.fy])
-        self._settings = settings
-        self._search_frames = search_frames
+        self._max_start, self._max_move = gate(tolerance), _MAX_MOVE * tolerance
         self._anchors = Anchors()
         self._poses: dict[int, Float64] = {}  # cam_from_world of the views that anchors were cut from
 
@@ -67,7 +69,7 @@ class KeypointRefiner:
                 continue
             self._poses[view.frame_index] = view.cam_from_world
             if view.frame_index % _FORGET_EVERY == 0:
-                self._forget(view.frame_index - self._search_frames, store)
+                self._forget(view.frame_index - MEMORY_FRAMES, store)
             dropped = view.refined & (view.points < 0)
             view.keypoints[dropped], view.refined[dropped] = view.detected[dropped], False
             rows = rows[~view.refined[rows]]
@@ -84,7 +86,7 @@ class KeypointRefiner:
         assert view.cam_from_world is not None
         if len(rows) == 0:
             return
-        settings, anchors = self._settings, self._anchors
+        anchors = self._anchors
         xyz = store.xyz[view.points[rows]]
         xyz_cam = se3.transform(view.cam_from_world, xyz)
         frames, of_frame = np.unique(anchors.frame_index[slots], return_inverse=True)
@@ -95,20 +97,20 @@ class KeypointRefiner:
         detected = view.detected[rows]
         xyz_cam[~visible, 2] = 1.0
         projected = self._camera.project(xyz_cam)
-        near = visible & (np.linalg.norm(projected - detected, axis=1) < settings.max_start)
+        near = visible & (np.linalg.norm(projected - detected, axis=1) < self._max_start)
         starts = np.where(near[:, None], projected, detected)
-        limit = settings.max_start + settings.max_move
+        limit = self._max_start + self._max_move
         found = align(view.image, starts, anchors.patches[slots], anchors.middles[slots], warps, limit)
         good = (
             visible
-            & (found.correlation >= settings.min_correlation)
-            & (found.deviation <= settings.max_deviation)
-            & (np.linalg.norm(found.places - detected, axis=1) <= settings.max_move)
+            & (found.correlation >= _MIN_CORRELATION)
+            & (found.deviation <= _MAX_DEVIATION)
+            & (np.linalg.norm(found.places - detected, axis=1) <= self._max_move)
         )
         view.keypoints[rows[good]] = found.places[good]
         view.refined[rows[good]] = True
         area = np.abs(np.linalg.det(warps))
-        outgrown = good & ((area > settings.max_area_ratio) | (area < 1.0 / settings.max_area_ratio))
+        outgrown = good & ((area > _MAX_AREA_RATIO) | (area < 1.0 / _MAX_AREA_RATIO))
         self._anchor(view, rows[outgrown])
 
     def _anchor(self, view: View, rows: Int64) -> None:

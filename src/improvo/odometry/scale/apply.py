@@ -63,6 +63,7 @@ def apply_scale(sequence: Sequence, run: Run, ask: Ask, settings: ScaleSettings)
     unit = report["scale"]
     sparse_map, points = read_map(run.folder / "map.ply"), read_points(run.folder / POINTS_FILE)
     points = replace(points, xyz=_scaled(points.xyz, points.segment, maps))
+    (run.folder / "run.json").unlink(missing_ok=True)  # until all files are in one unit, there is no result
     write_map(run.folder / "map.ply", replace(sparse_map, xyz=_scaled(sparse_map.xyz, sparse_map.segment, maps)), unit)
     with PointsWriter(run.folder / POINTS_FILE) as writer:
         writer.write(points)

@@ -100,7 +100,7 @@ def _together(measured: List[_Measured]) -> ScaleEstimate:
         a, b = measured[one], measured[other]
         raise InputError(
             f"--scale distance: frames {a.frames[0]} and {a.frames[1]} give {a.factor:.4g} m a unit, frames "
-            f"{b.frames[0]} and {b.frames[1]} give {b.factor:.4g} m, {100 * abs(b.factor / a.factor - 1):.2g} % apart; "
+            f"{b.frames[0]} and {b.frames[1]} give {b.factor:.4g} m, {_apart(b.factor / a.factor)} apart; "
             "measure again, or leave one out"
         )
     weights = 1 / variance
@@ -109,3 +109,9 @@ def _together(measured: List[_Measured]) -> ScaleEstimate:
     # what they really differ by counts where it is more than expected
     excess = np.sqrt(np.average((logs - mean) ** 2, weights=weights) / (len(measured) - 1))
     return ScaleEstimate(float(np.exp(mean)), float(max(expected, excess)), len(measured))
+
+
+def _apart(ratio: float) -> str:
+    """How far one scale is from another, in words."""
+    larger = max(ratio, 1 / ratio)
+    return f"a factor of {larger:.3g}" if larger >= 2 else f"{100 * abs(ratio - 1):.2g} %"

@@ -77,8 +77,8 @@ def find_markers(
     found = [marker for marker in found if views[marker.number] >= _LEAST_VIEWS]
     if not found:
         raise InputError(
-            f"--scale marker: no marker was seen in {_LEAST_VIEWS} of the {len(rows)} frames that were looked at; it "
-            "must be whole, sharp and some 30 pixels wide, an AprilTag or ArUco marker (scale.marker_dictionary)"
+            f"--scale marker: no marker was seen in at least {_LEAST_VIEWS} of {len(rows)} frames; it must be an "
+            "AprilTag or ArUco marker (scale.marker_dictionary), whole, sharp and some 30 pixels wide"
         )
     return found
 

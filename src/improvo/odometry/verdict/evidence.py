@@ -13,13 +13,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from improvo.backend.settings import ObjectiveSettings, SolverSettings
 from improvo.backend.solver import solve
 from improvo.errors import InputError
 from improvo.geometry import se3
 from improvo.geometry.alignment import align_points
 from improvo.geometry.camera import Camera
-from improvo.odometry.settings import VerdictSettings
+from improvo.odometry.gates import SAME_SCALE
+from improvo.odometry.mapping.window import OBJECTIVE, SOLVER
 from improvo.odometry.verdict.evidence_window import EvidenceKeyframe, EvidenceWindow
 from improvo.odometry.verdict.lens_evidence import LensMeasure, measured_lens
 from improvo.odometry.view import Mask, View
@@ -29,11 +29,9 @@ QUARTERS = ("without the upper left", "without the upper right", "without the lo
 HALVES = ("half of the points", "the other half of the points")
 PARTS = (*QUARTERS, *HALVES)
 
-_SOLVER = SolverSettings(max_iterations=8, relative_decrease=1e-3)
+_WINDOW = 12  # keyframes that are adjusted together from each part of the evidence; half of them overlap
 _FEW = 8  # observations or common points; fewer determine nothing
 _THIN = 6  # points seen on both sides of a gap between two keyframes; fewer carry no scale across it
-_LENS_KEYFRAMES = 8  # of a window that may say something of the focal length
-_UNDETERMINED = 0.11  # change of the logarithm of the scale that then counts, at least: enough for a mark
 _HASH = 2654435761  # a multiplier of Knuth's, so that the halves of the points are no halves of time or place
 
 
@@ -88,14 +86,10 @@ class EvidenceCheck:
 
     Args:
         camera: pinhole camera of the views.
-        settings: length of the windows.
-        objective: of the bundle adjustment.
     """
 
-    def __init__(self, camera: Camera, settings: VerdictSettings, objective: ObjectiveSettings) -> None:
+    def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self._settings = settings
-        self._objective = objective
         self._pending: list[EvidenceKeyframe] = []  # of the next window; those of the overlap are first
         self._overlap = 0
         self._paths = [_Path() for _ in PARTS]
@@ -122,7 +116,7 @@ class EvidenceCheck:
         self._pending.append(keyframe)
         self._centers.append(se3.inverse(cam_from_world)[:3, 3])
         self._fewest = min(self._fewest, len(rows))
-        if len(self._pending) == self._settings.window:
+        if len(self._pending) == _WINDOW:
             self._solve_window(xyz)
 
     def finish(self, xyz: Float64) -> Spread | None:
@@ -163,14 +157,14 @@ class EvidenceCheck:
             steps[part] = _continue(path, self._solved(window, mask), window, self._overlap)
         thin = window.fewest_across() < _THIN
         if thin:
-            steps = np.maximum(np.abs(steps), _UNDETERMINED)
+            steps = np.maximum(np.abs(steps), SAME_SCALE)
         if self._overlap or thin:
             self._scale_steps.append(steps)
             self._links.append(frames)
-        if self._lens_due and len(keyframes) >= _LENS_KEYFRAMES:
-            self._lens.append(measured_lens(window, frames, self._camera, self._objective))
+        if self._lens_due and len(keyframes) >= _FEW:
+            self._lens.append(measured_lens(window, frames, self._camera))
         self._lens_due = not self._lens_due
-        self._overlap = min(self._settings.window // 2, len(keyframes))
+        self._overlap = min(_WINDOW // 2, len(keyframes))
         self._pending = keyframes[len(keyframes) - self._overlap :]
         for path in self._paths:
             path.world_from_cam = path.world_from_cam[-self._overlap :]
@@ -187,7 +181,7 @@ class EvidenceCheck:
         problem, rows = window.problem(window.seen_at_least(2, mask), self._camera.K)
         if len(problem.keypoints) < _FEW * len(window):
             return _Solution(window.cam_from_world, rows, window.ids[rows], window.xyz[rows])
-        result = solve(problem, self._objective, _SOLVER)
+        result = solve(problem, OBJECTIVE, SOLVER)
         return _Solution(result.cam_from_world, rows, window.ids[rows], result.points)
 
 

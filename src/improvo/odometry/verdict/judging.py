@@ -15,14 +15,15 @@ class SegmentJudge:
 
     Args:
         camera: pinhole camera of the views.
-        settings: of the odometry; `verdict` and `objective` are used.
+        settings: of the odometry; `verdict` is used.
     """
 
     def __init__(self, camera: Camera, settings: OdometrySettings) -> None:
         self._settings = settings
-        self._evidence = EvidenceCheck(camera, settings.verdict, settings.objective)
+        self._evidence = EvidenceCheck(camera)
         self._alarms: list[str] = []
         self._suspicions: list[str] = []
+        self._halvings = 0
 
     def final(self, view: View, cam_from_world: Float64, xyz: Float64) -> None:
         """A view is final; keyframes are evidence.
@@ -40,8 +41,14 @@ class SegmentJudge:
         if words not in self._alarms:
             self._alarms.append(words)
 
-    def suspicion(self, words: str) -> None:
-        """Something that right segments show now and then, too; the same words count once."""
+    def suspicion(self, words: str, halvings: int = 1) -> None:
+        """Something that right segments show now and then, too; the same words count once.
+
+        Args:
+            words: plain.
+            halvings: how often it halves the error that is enough for a doubt; of several, the largest counts.
+        """
+        self._halvings = max(self._halvings, halvings)
         if words not in self._suspicions:
             self._suspicions.append(words)
 
@@ -51,4 +58,5 @@ class SegmentJudge:
         Args:
             xyz: (P, 3) its points.
         """
-        return judge(self._evidence.finish(xyz), self._settings.verdict, tuple(self._alarms), tuple(self._suspicions))
+        spread, limits = self._evidence.finish(xyz), self._settings.verdict
+        return judge(spread, limits, tuple(self._alarms), tuple(self._suspicions), self._halvings)

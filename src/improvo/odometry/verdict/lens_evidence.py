@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from improvo.backend.settings import ObjectiveSettings, SolverSettings
+from improvo.backend.settings import SolverSettings
 from improvo.backend.solver import solve
 from improvo.geometry.camera import Camera
+from improvo.odometry.mapping.window import OBJECTIVE
 from improvo.odometry.verdict.evidence_window import EvidenceWindow
 
 _STEP = 0.15  # of the logarithm of the focal length, to both sides
@@ -39,16 +40,13 @@ class LensMeasure:
     growth_error: float
 
 
-def measured_lens(
-    window: EvidenceWindow, frames: tuple[int, int], camera: Camera, objective: ObjectiveSettings
-) -> LensMeasure:
+def measured_lens(window: EvidenceWindow, frames: tuple[int, int], camera: Camera) -> LensMeasure:
     """Adjust a window with other focal lengths.
 
     Args:
         window: of several keyframes.
         frames: its first and last frame.
         camera: as given.
-        objective: of the bundle adjustment.
     """
     mask = window.seen_at_least(3)
     if not mask.any():
@@ -62,7 +60,7 @@ def measured_lens(
         K, center = camera.K.copy(), camera.K[:2, 2]
         K[[0, 1], [0, 1]] *= np.exp(offset)
         scaled = center + (window.keypoints - center) / np.exp(growth * along)[window.camera, None]
-        return float(solve(window.problem(mask, K, scaled)[0], objective, _SOLVER).cost)
+        return float(solve(window.problem(mask, K, scaled)[0], OBJECTIVE, _SOLVER).cost)
 
     given = cost()
     variance = given / max(equations, 1)

@@ -60,3 +60,21 @@ def verdict_lines(report: Mapping[str, Any], only: str | None = None) -> list[st
         frames = f"frames {each['first']} to {each['last']}"
         lines.append(f"segment {each['number']} ({frames}) is {verdict['word']}: {why}")
     return lines
+
+
+def what_doubt_means(report: Mapping[str, Any]) -> list[str]:
+    """What a person can do about doubtful segments, a line each; none where there is no such segment.
+
+    Args:
+        report: the content of run.json.
+    """
+    doubted = verdict_lines(report, only=DOUBTFUL)
+    if not doubted:
+        return []
+    lines = ["what is doubtful may be wrong, and makes no labels; look at it before you use it"]
+    if any("the focal length" in line for line in doubted):
+        lines.append(
+            "if the lens zoomed, cut the recording there and give each part its own camera; if not, calibrate "
+            "(`improvo calibrate`), or leave out what moves (`--mask`)"
+        )
+    return lines

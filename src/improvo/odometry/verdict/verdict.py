@@ -8,13 +8,19 @@ from typing import Any
 
 import numpy as np
 
+from improvo.odometry.gates import SAME_SCALE
 from improvo.odometry.settings import VerdictSettings
 from improvo.odometry.verdict.evidence import HALVES, PARTS, QUARTERS, Spread
 from improvo.types import Float64
 
+_SCALE_SHARE = 40.0  # % of the path that a change of scale by the factor e moves (calibrated: docs/odometry.md)
+_USUAL_NOISE = 0.0016  # share of the picture's width; the estimate grows with noise that is larger
 _NOISE_POWER = 3  # noise of 1.4 times the usual one came with 3 to 5 times the spread (docs/robustness-odometry.md)
+_FOCAL_CHANGE = 0.12  # of the logarithm of the focal length, within a window or from one to the next
+_FOCAL_ERROR = 0.2  # of the logarithm of the focal length, from that of the camera as given
 _SIGMAS = 5.0  # standard errors that a deviation of the focal length must exceed
 _SIGMAS_OF_GROWTH = 8.0  # its change within a window, which a step ahead imitates; 6.7 at most in right recordings
+_RARE = 0.01  # share of windows that say so in right recordings; one of the hundreds of a long one is no alarm
 _LARGEST_LENS_ERROR = 0.06  # of the logarithm of a focal length; a window that knows it less well says nothing of it
 RIGHT, DOUBTFUL, NOT_JUDGED = "right", "doubtful", "not judged"
 
@@ -53,6 +59,7 @@ def judge(
     settings: VerdictSettings,
     alarms: tuple[str, ...] = (),
     suspicions: tuple[str, ...] = (),
+    halvings: int = 1,
 ) -> Verdict:
     """The verdict of a segment by the spread of its path, and by what else was seen.
 
@@ -60,16 +67,20 @@ def judge(
         spread: of the paths from the parts of the evidence; None where the segment is too short for one.
         settings: the limits.
         alarms: in plain words; each makes the segment doubtful.
-        suspicions: in plain words; where there is one, half of the largest error is enough.
+        suspicions: in plain words; where there is one, a smaller error is enough for a doubt,
+        halvings: by half each.
     """
     if spread is None:
         return Verdict(DOUBTFUL if alarms else NOT_JUDGED, evidence=(*alarms, "too few keyframes to judge the path"))
-    alarms = (*alarms, *_lens_alarms(spread, settings))
-    error = estimated_error(spread, settings)
-    uncertain = _uncertain(spread, settings)
-    evidence = [*alarms, *suspicions, _in_words(spread, error, settings)]
+    of_lens = _said_of_lens(spread)
+    if len(of_lens) > _RARE * len(spread.lens):
+        alarms = (*alarms, of_lens[0])
+    error = estimated_error(spread)
+    uncertain = _uncertain(spread)
+    evidence = [*alarms, *suspicions, _in_words(spread, error)]
+    evidence += [words for words in of_lens[:1] if words not in alarms]
     evidence += [f"frames {first} to {last}: the scale is not determined" for first, last in uncertain]
-    limit = 0.5 * settings.max_error if suspicions else settings.max_error
+    limit = settings.max_error * 0.5 ** (halvings if suspicions else 0)
     word = RIGHT if error <= limit and not alarms else DOUBTFUL
     return Verdict(word, error, spread.noise_px, tuple(evidence), uncertain)
 
@@ -93,16 +104,16 @@ def joined(first: Verdict, second: Verdict, scale_error: float) -> Verdict:
     )
 
 
-def estimated_error(spread: Spread, settings: VerdictSettings) -> float:
+def estimated_error(spread: Spread) -> float:
     """Error of the segment's positions after Sim3, % of its path.
 
     The root sum of squares of what the paths of the parts differ by, and of what the least certain change of scale
     moves. Of the two halves of the points the better one counts twice: the other can have too few by chance. Unusual
     noise is worse than its spread: what does not fit is dropped, so what stays agrees with what is wrong.
     """
-    noise = np.nan_to_num(spread.noise_px) / (settings.usual_noise * spread.width)
+    noise = np.nan_to_num(spread.noise_px) / (_USUAL_NOISE * spread.width)
     quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
-    scale = settings.scale_share * float(_scale_errors(spread).max(initial=0.0))
+    scale = _SCALE_SHARE * float(_scale_errors(spread).max(initial=0.0))
     spreads = (quarters**2).sum() + len(HALVES) * halves.min() ** 2 + scale**2
     return float(max(noise, 1.0) ** _NOISE_POWER * np.sqrt(spreads))
 
@@ -112,37 +123,37 @@ def _scale_errors(spread: Spread) -> Float64:
     return np.asarray(np.median(np.abs(spread.scale_steps), axis=1), np.float64)
 
 
-def _lens_alarms(spread: Spread, settings: VerdictSettings) -> tuple[str, ...]:
-    """What contradicts that one lens, the camera's, looked at one world that stands still; most telling first.
+def _said_of_lens(spread: Spread) -> tuple[str, ...]:
+    """What windows say against that one lens, the camera's, looked at one world that stands still; most telling first.
 
     A focal length that is not the camera's can be a zoom or a wrong calibration. Where something large moves, too, its
     motion and the camera's fit together only with a focal length that is wrong and changes.
     """
-    alarms: list[str] = []
+    said: list[str] = []
     sure = [each for each in spread.lens if each.offset_error < _LARGEST_LENS_ERROR]
     for each in spread.lens:
         first, last = each.frames
-        if abs(each.growth) > max(settings.max_focal_change, _SIGMAS_OF_GROWTH * each.growth_error):
-            alarms.append(_told(first, last, f"changes by {100 * abs(np.expm1(each.growth)):.0f} %"))
+        if abs(each.growth) > max(_FOCAL_CHANGE, _SIGMAS_OF_GROWTH * each.growth_error):
+            said.append(_told(first, last, f"changes by {100 * abs(np.expm1(each.growth)):.0f} %"))
     for each in sure:
         first, last = each.frames
-        if abs(each.offset) > max(settings.max_focal_error, _SIGMAS * each.offset_error):
-            alarms.append(_told(first, last, f"is {np.exp(each.offset):.2f} times that of the camera as given"))
+        if abs(each.offset) > max(_FOCAL_ERROR, _SIGMAS * each.offset_error):
+            said.append(_told(first, last, f"is {np.exp(each.offset):.2f} times that of the camera as given"))
     for a, b in pairwise(sure):
         change = b.offset - a.offset
-        if abs(change) > max(settings.max_focal_change, _SIGMAS * float(np.hypot(a.offset_error, b.offset_error))):
-            alarms.append(_told(a.frames[0], b.frames[1], f"changes by {100 * abs(np.expm1(change)):.0f} %"))
-    return tuple(alarms[:1])
+        if abs(change) > max(_FOCAL_CHANGE, _SIGMAS * float(np.hypot(a.offset_error, b.offset_error))):
+            said.append(_told(a.frames[0], b.frames[1], f"changes by {100 * abs(np.expm1(change)):.0f} %"))
+    return tuple(said)
 
 
 def _told(first: int, last: int, words: str) -> str:
     return f"frames {first} to {last} fit best if the focal length {words}: a zoom, a wrong calibration, or a mover"
 
 
-def _uncertain(spread: Spread, settings: VerdictSettings) -> tuple[tuple[int, int], ...]:
+def _uncertain(spread: Spread) -> tuple[tuple[int, int], ...]:
     """Stretches (first and last frame) across which the parts of the evidence disagree about the scale."""
     found: list[tuple[int, int]] = []
-    for first, last in spread.link_frames[_scale_errors(spread) > settings.max_scale_error].tolist():
+    for first, last in spread.link_frames[_scale_errors(spread) >= SAME_SCALE].tolist():
         if found and first <= found[-1][1]:
             found[-1] = (found[-1][0], last)
         else:
@@ -150,15 +161,15 @@ def _uncertain(spread: Spread, settings: VerdictSettings) -> tuple[tuple[int, in
     return tuple(found)
 
 
-def _in_words(spread: Spread, error: float, settings: VerdictSettings) -> str:
+def _in_words(spread: Spread, error: float) -> str:
     """What the estimate rests on, in plain words."""
     quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
     worst = int(np.argmax(quarters))
     words = f"estimated error {error:.1f} % of the path: "
-    if spread.noise_px > 1.5 * settings.usual_noise * spread.width:
+    if spread.noise_px > 1.5 * _USUAL_NOISE * spread.width:
         words += f"the points are {spread.noise_px:.1f} pixels off, and "
     scale = float(_scale_errors(spread).max(initial=0.0))
-    if settings.scale_share * scale > float(np.linalg.norm(spread.error_percent)):
+    if _SCALE_SHARE * scale > float(np.linalg.norm(spread.error_percent)):
         first, last = spread.link_frames[int(np.argmax(_scale_errors(spread)))].tolist()
         return words + f"the scale between frames {first} and {last} is known to {100 * scale:.0f} % only"
     if quarters[worst] > 2.0 * halves.max():
