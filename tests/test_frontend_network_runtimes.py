@@ -6,6 +6,7 @@ import dataclasses
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import cv2
@@ -107,6 +108,26 @@ except MissingExtraError as error:
 """
     done = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
     assert answer in done.stdout
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity") or os.cpu_count() == 1, reason="nothing to pin to")
+def test_a_network_with_one_thread_stays_on_no_core():
+    """Several processes would all be on the first."""
+    frontend = NetworkFrontend(random_weights(TINY), NetworkSettings(threads=1))
+    images = np.zeros((1, 1, 480, 640), np.float32)
+    computing, ended, found = threading.get_native_id(), threading.Event(), set()
+
+    def watch() -> None:
+        while not ended.wait(0.0002):
+            found.add(frozenset(os.sched_getaffinity(computing)))
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    for _ in range(20):
+        frontend.runtime(images)
+    ended.set()
+    watcher.join()
+    assert found == {frozenset(os.sched_getaffinity(computing))}
 
 
 def cosines(a, b):

@@ -44,6 +44,14 @@ def tick_until_stopped(number: int, tick: Tick) -> None:
         time.sleep(0.01)
 
 
+def tick_for_ever(number: int, tick: Tick) -> None:
+    """Heeds no interrupt."""
+    while True:
+        with contextlib.suppress(KeyboardInterrupt):
+            tick()
+            time.sleep(0.01)
+
+
 class DyingCounter:
     """As the actor that counts ticks, on a node that dies."""
 
@@ -146,12 +154,15 @@ def test_a_node_that_dies_costs_what_it_had_in_work(nodes, cluster, tmp_path):
     assert third.node_id in {tries[0] for tries in tried}
 
 
-def test_an_interrupt_cancels_what_runs(cluster):
+@pytest.mark.parametrize("work", [tick_until_stopped, tick_for_ever])
+def test_an_interrupt_cancels_what_runs(cluster, monkeypatch, work):
+    monkeypatch.setattr("improvo.jobs.on_ray._CANCEL_SECONDS", 3.0)
+
     def interrupt(count: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_on_ray(tick_until_stopped, [1, 2, 3], lambda job, result: None, interrupt, "local")
+        run_on_ray(work, [1, 2, 3], lambda job, result: None, interrupt, "local")
     assert run(die_on_one, [2])[0] == {2: 2}  # needs a core that is free again
 
 

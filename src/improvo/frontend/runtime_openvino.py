@@ -44,7 +44,12 @@ class OpenVinoRuntime:
         self.name = "openvino-int8" if int8 else "openvino-float32"
         self._graph = _Graph(weights, weights.card.activation_ranges if int8 else {})
         # Left to itself, OpenVINO may compute in bfloat16 and in several streams: other numbers on other machines.
-        self._options: dict[str, Any] = {"INFERENCE_PRECISION_HINT": "f32", "NUM_STREAMS": 1}
+        # Pinned threads of several processes would all be on the first cores.
+        self._options: dict[str, Any] = {
+            "INFERENCE_PRECISION_HINT": "f32",
+            "NUM_STREAMS": 1,
+            "ENABLE_CPU_PINNING": False,
+        }
         if threads:
             self._options["INFERENCE_NUM_THREADS"] = threads
         self._compiled: dict[tuple[int, ...], Any] = {}

@@ -71,10 +71,7 @@ def run_on_ray(
                     on_result(running.pop(reference), _result(ray, reference))
             _tell(ray, counter, told, on_ticks)
         except BaseException:
-            for reference in running:
-                ray.cancel(reference)
-            if running:
-                ray.wait(list(running), num_returns=len(running), timeout=_CANCEL_SECONDS)
+            _cancel(ray, list(running))
             raise
 
 
@@ -146,6 +143,15 @@ def _result(ray: Any, reference: Any) -> Any:
     except ray.exceptions.RayError as error:
         reason = str(error).strip().splitlines()[0]
         return WorkerDiedError(f"its Ray worker died ({type(error).__name__}: {reason}); run again")
+
+
+def _cancel(ray: Any, references: list[Any]) -> None:
+    """Ends what runs; with its process what heeds no interrupt, as where Ray was started with them ignored."""
+    for force in (False, True):
+        for reference in references:
+            ray.cancel(reference, force=force)
+        if references:
+            _, references = ray.wait(references, num_returns=len(references), timeout=_CANCEL_SECONDS)
 
 
 def _tell(ray: Any, counter: Any, told: int, on_ticks: Callable[[int], None]) -> int:
