@@ -165,7 +165,8 @@ def test_the_loop_runs_what_is_held_back_more_than_once(
     # all once for the reference, and the fifth held back with the start and in each of two rounds
     assert values["labelings"] == pytest.approx(1.6)
     assert values["labelling"]["core_hours"] == pytest.approx(1.6 * (1000 * 0.1 + 2.0) / 3600, abs=1e-3)
-    depth, training, pairs = 800 + 200, 2 * (10 + 2 * 1200), 3 * 3 * 100 * 0.5
+    metric = 800 * 0.1 + 1500 * 0.02  # features of the frames, and its pairs
+    depth, training, pairs = 800 + 200, 2 * (10 + 2 * 800 + metric), 3 * 3 * 100 * 0.5
     assert values["others"]["other_minutes"] == pytest.approx((depth + training + pairs) / 60)
     assert values["others"]["measured"]
     assert [path.name for path in tmp_path.iterdir()] == ["attic"]
