@@ -96,14 +96,14 @@ def chosen_frames(which: str, count: int, flag: str = "--frames") -> list[int]:
     except ValueError:
         numbers = []
     if not numbers:
-        raise ConfigError(f"--frames {which}: give `all`, a list such as 10,50,90 (one: 10,), or a number of frames")
+        raise ConfigError(f"{flag} {which}: give `all`, a list such as 10,50,90 (one: 10,), or a number of frames")
     if "," in which:
         wrong = [number for number in numbers if not 0 <= number < count]
         if wrong:
             raise ConfigError(f"{flag} {which}: there is no frame {wrong[0]}; frames are 0 to {count - 1}")
         return numbers
     if numbers[0] < 1:
-        raise ConfigError(f"--frames {which}: must be at least 1")
+        raise ConfigError(f"{flag} {which}: must be at least 1")
     spread = min(numbers[0], count)
     return [round((i + 0.5) * count / spread - 0.5) for i in range(spread)]  # the middles of equal parts
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from improvo.errors import InputError
 from improvo.frontend.weights import load_weights, save_weights
 from improvo.improvement.reference import ReferencePart
 from improvo.improvement.settings import HELD, METRIC, TRACKS, ImproveSettings
@@ -114,13 +113,15 @@ def _train_held(job: TrainingJob) -> dict[str, Any]:
 
 
 def _train_metric(job: TrainingJob) -> dict[str, Any]:
+    from improvo.training.descriptor_metric import NoDescriptorMapError
     from improvo.training.metric_training import train_metric
 
     settings = job.settings.metric
     settings = replace(settings, seed=job.seed, two_frames=settings.two_frames and not job.control)
+    teaching = _teaching(job, settings.longer_side)
     try:
-        return train_metric(_teaching(job, settings.longer_side), settings, job.output, job.start, job.data)
-    except InputError:  # too few keypoints were found again, of which another stage may have learned all the same
+        return train_metric(teaching, settings, job.output, job.start, job.data)
+    except NoDescriptorMapError:  # another stage may have learned all the same
         if job.settings.recipe == METRIC:
             raise
         weights = load_weights(job.start)

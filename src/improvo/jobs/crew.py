@@ -21,10 +21,10 @@ class Crew:
     Args:
         workers: jobs at a time, a process with one core for each. If None, one after another in this process, which
             uses what cores are free, or with `ray` as many as the cluster has cores.
+        ray: address of a Ray cluster, see `improvo.jobs.on_ray`.
 
     Raises:
         ConfigError: fewer than one worker.
-        ray: address of a Ray cluster, see `improvo.jobs.on_ray`.
     """
 
     workers: int | None = None
@@ -65,7 +65,7 @@ class Crew:
 
             if self.ray is not None:
                 run_on_ray(work, waiting, take, on_ticks, self.ray, self.workers, gpus)
-            elif self.workers is None or len(jobs) == 1 < self.workers:
+            elif self.workers is None or (len(jobs) == 1 and self.workers > 1):
                 run_here(work, waiting, take, on_ticks)
             else:
                 run_in_processes(work, waiting, take, on_ticks, min(self.workers, len(waiting)))

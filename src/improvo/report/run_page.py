@@ -93,7 +93,8 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
     )
     page.heading("What to look out for")
     page.warnings(warnings(report, shown, brightness, median_error), "Nothing: every frame has a pose, in one segment.")
-    believed = [line for line in verdict_lines(report) if line not in verdict_lines(report, only=DOUBTFUL)]
+    doubted = verdict_lines(report, only=DOUBTFUL)  # are among the warnings
+    believed = [line for line in verdict_lines(report) if line not in doubted]
     if believed:
         page.paragraph(" ".join(f"{line[0].upper()}{line[1:]}." for line in believed))
     if len(run.trajectory):

@@ -22,6 +22,10 @@ from improvo.types import Features, Float32, Float64, Int64
 _LAST = "descriptor.1.convolution"  # the layer that the map becomes part of
 
 
+class NoDescriptorMapError(InputError):
+    """The keypoints that were found again do not tell a map."""
+
+
 @dataclass(frozen=True)
 class MetricSettings:
     """How the map is made; importable without torch."""
@@ -85,11 +89,11 @@ class Scatter:
             shrinkage: of the covariances towards a multiple of the identity, above 0 and at most 1.
 
         Raises:
-            InputError: too few correspondences to say anything.
+            NoDescriptorMapError: too few correspondences, or they say nothing.
         """
         least = 4 * len(self.same)
         if self.count < least:
-            raise InputError(
+            raise NoDescriptorMapError(
                 f"descriptors: {self.count} keypoints were found again in another frame where {least} are needed; "
                 "give more frames, or ones that show the same places"
             )
@@ -97,7 +101,9 @@ class Scatter:
         values, vectors = np.linalg.eigh(difference)
         values = np.maximum(values, 0.0)  # a direction in which mistakes are nearer than the right ones says nothing
         if not values.sum() > 0:
-            raise InputError("descriptors: those of the same place are no nearer than wrong ones; check the poses")
+            raise NoDescriptorMapError(
+                "descriptors: those of the same place are no nearer than wrong ones; check the poses"
+            )
         root = (vectors * np.sqrt(values)) @ vectors.T
         return np.asarray(root * np.sqrt(len(root) / (root**2).sum()))
 

@@ -52,7 +52,7 @@ def train_metric(
         `correspondences`, `pairs` and `seconds`.
 
     Raises:
-        InputError: too few keypoints were found again.
+        NoDescriptorMapError: too few keypoints were found again, or they say nothing.
         ConfigError: the folder was begun with other settings.
     """
     begun = time.monotonic()
