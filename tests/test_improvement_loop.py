@@ -424,6 +424,12 @@ def test_a_growing_set_starts_from_the_last_weights_and_replays_what_it_had(
             run(output, sequences, FakeTraining(), rounds=1, settings=default, after=before)
     with pytest.raises(InputError, match="no finished folder"):
         run(tmp_path / "other", [hall], FakeTraining(), settings=default, after=tmp_path)
+    with pytest.raises(InputError, match="trained on it, so it cannot be held back"):
+        run(tmp_path / "other", [hall], FakeTraining(), settings=default, after=before, evaluate=[walk])
+    begun = shutil.copytree(before, tmp_path / "begun")
+    shutil.rmtree(begun / "round-1")
+    with pytest.raises(InputError, match="no finished folder"):
+        run(tmp_path / "other", [hall], FakeTraining(), settings=default, after=begun)
     assert not (tmp_path / "other").exists()
     with pytest.raises(ConfigError, match="begun with"):
         run(tmp_path / "more", [hall], FakeTraining(), rounds=1, settings=default)

@@ -89,6 +89,11 @@ class HealthCheck:
         return bool(decides and map_inliers < _AGREEMENT * own_inliers)
 
     @property
+    def has_judged(self) -> bool:
+        """Whether there were checks enough to say that a map is wrong."""
+        return len(self._rounds) == _ROUNDS
+
+    @property
     def ambiguous(self) -> bool:
         """Whether the last checks saw another motion beside the map's, so that one of both is not the camera's."""
         return self._two_motions >= _ROUNDS - 1

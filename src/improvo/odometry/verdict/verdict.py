@@ -67,8 +67,8 @@ def judge(
         spread: of the paths from the parts of the evidence; None where the segment is too short for one.
         settings: the limits.
         alarms: in plain words; each makes the segment doubtful.
-        suspicions: in plain words; where there is one, a smaller error is enough for a doubt,
-        halvings: by half each.
+        suspicions: in plain words; where there is one, a smaller error is enough for a doubt.
+        halvings: how often the limit is halved then.
     """
     if spread is None:
         return Verdict(DOUBTFUL if alarms else NOT_JUDGED, evidence=(*alarms, "too few keyframes to judge the path"))
@@ -88,18 +88,19 @@ def judge(
 def joined(first: Verdict, second: Verdict, scale_error: float) -> Verdict:
     """The verdict of two stretches of one world, with a scale between them that is known to `scale_error` (relative).
 
-    The worse of the two counts; the scale between them moves half of the path by that share of its size at most.
+    The worse of the two counts: a doubtful one before a right one, then the one with the larger error. The scale
+    between them moves half of the path by that share of its size at most.
     """
     if NOT_JUDGED in (first.word, second.word):
         known = second if first.word == NOT_JUDGED else first
         return Verdict(known.word, known.error_percent, known.noise_px, known.evidence, known.uncertain)
-    errors = first.error_percent, second.error_percent, 50.0 * scale_error
-    worse = first if first.error_percent >= second.error_percent else second
+    better, worse = sorted((first, second), key=lambda each: (each.word == DOUBTFUL, np.nan_to_num(each.error_percent)))
+    alarms = better.evidence[:1] if better.word == DOUBTFUL else ()
     return Verdict(
-        DOUBTFUL if DOUBTFUL in (first.word, second.word) else RIGHT,
-        max(errors),
-        max(first.noise_px, second.noise_px),
-        (*worse.evidence, f"joined, scale ±{100 * scale_error:.1g} %"),
+        worse.word,
+        float(np.nanmax([first.error_percent, second.error_percent, 50.0 * scale_error])),
+        float(np.fmax(first.noise_px, second.noise_px)),
+        (*worse.evidence, *alarms, f"joined, scale ±{100 * scale_error:.1g} %"),
         (*first.uncertain, *second.uncertain),
     )
 
