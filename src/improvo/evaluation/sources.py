@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
+import re
 import zlib
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
 
-from improvo.errors import InputError
+from improvo.errors import ConfigError, InputError
+from improvo.evaluation.settings import PEERS
 from improvo.frontend import Frontend
 from improvo.frontend.masking import features_of
 from improvo.sequences import Sequence, SequenceSettings
 from improvo.types import Features, Frame, UInt8
-
-PEERS = ("xfeat", "aliked", "disk")
 
 
 class SequenceSource(Protocol):
@@ -149,6 +149,34 @@ def _weights_digest(name: str) -> str | None:
     if name not in bundled_names() and not name.endswith(".safetensors"):
         return None
     return hashlib.sha256(find_weights(name).read_bytes()).hexdigest()
+
+
+def file_name(label: str) -> str:
+    """A label as the name of a file or folder."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", label).strip(".") or "_"
+
+
+def refuse_equal_names(what: str, names: list[str]) -> None:
+    """Refuse names that tables or folders could not tell apart.
+
+    Args:
+        what: is named, in the plural.
+        names: of all of them.
+
+    Raises:
+        ConfigError: two are the same or have the same folder, or there is none.
+    """
+    if not names:
+        raise ConfigError(f"no {what} given")
+    first: dict[str, str] = {}
+    for name in names:
+        other = first.setdefault(file_name(name), name)
+        if other != name:
+            raise ConfigError(f"{what}: `{other}` and `{name}` would share the folder `{file_name(name)}`; rename one")
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        mend = "name one by LABEL=NAME" if what == "frontends" else "rename one"
+        raise ConfigError(f"{what}: `{min(twice)}` is given twice; {mend}")
 
 
 def sequence_fingerprint(source: SequenceSource, sequence: Sequence) -> dict[str, Any]:
