@@ -33,7 +33,7 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)  # the same maps give the same bytes
 
 
 class DepthWriter:
-    """`with DepthWriter(path, K, size, farthest) as maps: maps.write(frame, depth)`: the file appears at the end.
+    """`with DepthWriter(path, K, farthest) as maps: maps.write(frame, depth)`: the file appears at the end.
 
     Args:
         path: of the file.
