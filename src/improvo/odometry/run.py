@@ -63,6 +63,13 @@ def unit_of(report: dict[str, Any]) -> str:
     return str(report["scale"]) if report.get("metric") else "up to scale"
 
 
+def metres_per_unit(report: dict[str, Any], segment: int) -> float:
+    """Metres per unit of the odometry in a segment of a run, by its run.json; 1 where the run is up to scale."""
+    known = {each["segment"]: each["metres_per_unit"] for each in (report.get("metric") or {}).get("segments", [])}
+    before = [number for number in sorted(known) if number <= segment] or sorted(known)[:1]
+    return float(known[before[-1]]) if before else 1.0
+
+
 def run_odometry(
     sequence: Sequence,
     folder: Path,
