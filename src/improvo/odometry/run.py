@@ -116,9 +116,11 @@ def run_odometry(
             frontend, sequence.camera, settings.odometry, settings.frontend.use_stability, on_final=final
         )
         visualizer.begin(sequence.camera)
-        processed, interrupted = _track_all(sequence, frontend, odometry, visualizer, progress, seconds)
-        odometry.finish()
-        visualizer.end()
+        try:
+            processed, interrupted = _track_all(sequence, frontend, odometry, visualizer, progress, seconds)
+            odometry.finish()
+        finally:
+            visualizer.end()
         if len(processed) < _MIN_FRAMES and not interrupted:
             raise InputError(f"{sequence.path}: only {len(processed)} of its frames can be read; check the recording")
     trajectory = odometry.trajectory
