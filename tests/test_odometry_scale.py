@@ -371,6 +371,13 @@ def test_settings_are_checked() -> None:
         {"source": "distance", "distances": ((1, 2, -3.0),)},
         {"source": "truth", "began": "12.5"},
         {"source": "marker", "metres": float("nan")},
+        {"metres": 1.0},
+        {"source": "depth", "metres": 1.0},
+        {"source": "distance", "distances": ((1, 2, 3.0),), "metres": 1.0},
+        {"source": "truth", "metres": 1.0},
+        {"reference": "gps.gpx"},
+        {"source": "height", "metres": 1.0, "reference": "gps.gpx"},
+        {"source": "depth", "marker_dictionary": "DICT_4X4_50"},
     ):
         with pytest.raises(ConfigError):
             ScaleSettings(**wrong)  # type: ignore[arg-type]
