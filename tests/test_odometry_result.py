@@ -109,6 +109,15 @@ class TestPlacement:
         placement.begin_next()
         assert placement.similarity.scale == 3.0
 
+    def test_points_behind_the_camera_do_not_turn_the_next_segment_inside_out(self) -> None:
+        placement = SegmentPlacement()
+        placement.place(np.eye(4), np.array([-2.0, -1.0, 3.0]))
+        placement.begin_next()
+        assert placement.similarity.scale == 3.0
+        placement.place(np.eye(4), np.array([-2.0, 0.0]))
+        placement.begin_next()
+        assert placement.similarity.scale == 3.0
+
 
 class TestMap:
     def test_mean_and_largest_error_and_count_of_each_point(self) -> None:

@@ -106,14 +106,15 @@ def label_sequences(
         MissingExtraError: Ray is not installed.
         OutputError, ConfigError: the store cannot be used, see `LabelStore`, or its location does not answer any more.
     """
-    names = sequence_names(list(paths))
+    sequence_names(list(paths))  # refuses what is given twice before there is a store
     settings = replace(settings, sequence=with_absolute_files(settings.sequence))
     store = LabelStore(folder, fingerprint(settings, pack), relabel, type(settings))
-    before = {record.name: record for record in store.records() if record.state == DONE}
+    # a failure whose recording is gone leaves its name to whoever comes
+    stored = [record for record in store.records() if record.state == DONE or Path(record.path).exists()]
+    names = sequence_names(list(paths), stored)
+    before = {record.name: record for record in stored if record.state == DONE}
     records = {name: before[name] for name in names if name in before}
-    for name, record in records.items():
-        if record.path != str(names[name]):
-            raise InputError(f"{names[name]}: the store has another recording named {name}; rename one of them")
+    for record in records.values():
         on_record(record)
     url = url_of(store.folder)
     jobs = [
