@@ -9,6 +9,7 @@ import sys
 
 import pytest
 
+from improvo.cli.main import main
 from improvo.jobs.interrupts import interrupts_wait, termination_interrupts
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
@@ -35,6 +36,7 @@ def test_termination_is_an_interrupt_after_colmap_was_loaded_too() -> None:
     program = """
 import os, signal
 from improvo.evaluation.truth.structure_from_motion import load_pycolmap
+from improvo.cli.main import main
 from improvo.jobs.interrupts import termination_interrupts
 try:
     with termination_interrupts():
@@ -83,3 +85,26 @@ def test_where_interrupts_are_ignored_they_stay_so() -> None:
     with interrupts_wait():
         os.kill(os.getpid(), signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+
+def test_an_interrupt_within_compiled_code_ends_a_command_as_any_other(capsys, monkeypatch, tmp_path) -> None:
+    """Numba makes a SystemError of it."""
+
+    def compiled(*_: object) -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        except KeyboardInterrupt as interrupt:
+            raise SystemError("CPUDispatcher(...) returned a result with an exception set") from interrupt
+
+    monkeypatch.setattr("improvo.cli.info.run", compiled)
+    assert main(["info", str(tmp_path)]) == 130
+    assert capsys.readouterr().err == "improvo: interrupted\n"
+
+
+def test_another_error_of_compiled_code_stays_one(monkeypatch, tmp_path) -> None:
+    def compiled(*_: object) -> None:
+        raise SystemError("something else")
+
+    monkeypatch.setattr("improvo.cli.info.run", compiled)
+    with pytest.raises(SystemError):
+        main(["info", str(tmp_path)])
