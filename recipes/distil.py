@@ -27,7 +27,8 @@ from improvo.frontend.superpoint import SuperPoint, sample_descriptors
 from improvo.frontend.weights import find_weights, load_weights, save_weights
 from improvo.training.losses import held_loss
 from improvo.training.pack import read_pack
-from improvo.types import UInt8
+from improvo.training.trainer import choose_precision
+from improvo.types import Float64, UInt8
 
 KEYPOINTS = 500
 LEAST = 64  # keypoints of a frame
@@ -35,16 +36,17 @@ REACH = 6  # frames of a source between two that are compared
 SCALE = 28.0  # inverse temperature of the teachers' similarities
 NEAR = 8.0  # pixels; keypoints of a frame nearer than this are not compared with each other
 AVERAGE = 0.998
+BFLOAT16 = choose_precision("auto", torch.device("cpu")) is torch.bfloat16
 
 
 @dataclass(frozen=True)
 class Frame:
     """What is known of a frame before training."""
 
-    stem: Tensor  # (1, C, h, w) what the frozen layers make of it
+    stem: Tensor  # (1, C, h, w) float16, what the frozen layers make of it
     keypoints: Tensor  # (1, N, 2) pixels
-    taught: list[Tensor]  # (N, D) unit descriptors of each teacher
-    detector: Tensor  # (1, 65, Hc, Wc) logits that are held to
+    taught: list[Tensor]  # (N, D) float16 unit descriptors of each teacher
+    detector: Tensor  # (1, 65, Hc, Wc) float16 logits that are held to
 
 
 def main() -> None:
@@ -64,17 +66,21 @@ def main() -> None:
     parent = load_weights(find_weights(arguments.start))
     network = load_network(without_dead_channels(parent)).requires_grad_(False).eval()
     pictures, posed, data = read_pack(arguments.pack)
-    sources = [sequence.pictures for sequence in posed] + [source.pictures for source in pictures.sources]
-    groups = [known_frames(chosen[:: -(-len(chosen) // arguments.most)], network, arguments) for chosen in sources]
-    groups = [group for group in groups if len(group) > 1]
+    sources = [*posed, *pictures.sources]
+    chosen = [source.pictures[:: -(-len(source.pictures) // arguments.most)] for source in sources]
+    groups = [known_frames(frames, network, arguments) for frames in chosen]
     print(f"{sum(map(len, groups))} frames of {len(groups)} sources", flush=True)
-    average = distilled(network, groups, arguments)
+    average = distilled(network, groups, np.array([source.weight for source in sources]), arguments)
     tensors = {name: value.numpy() for name, value in average.state_dict().items()}
-    training = {"stage": "distil", "start": arguments.start, "teachers": arguments.teachers, "steps": arguments.steps}
-    sources_of_all = {source.name: source for source in (*parent.card.data, *data)}
-    card = replace(
-        parent.card, training=training, data=tuple(sources_of_all.values()), metrics={}, activation_ranges={}
-    )
+    settings = {
+        key: value for key, value in vars(arguments).items() if key not in ("pack", "output", "start", "teachers")
+    }
+    training = {
+        "stage": "distil", "start": arguments.start, "teachers": arguments.teachers, **settings,
+        "frames": sum(map(len, groups)), "stability_trained": parent.card.training.get("stability_trained", False),
+    }  # fmt: skip
+    licences = {source.name: source for source in (*parent.card.data, *data)}
+    card = replace(parent.card, training=training, data=tuple(licences.values()), metrics={}, activation_ranges={})
     save_weights(arguments.output, with_dead_channels(tensors, parent.architecture), card)
 
 
@@ -94,14 +100,18 @@ def known_frames(pictures: tuple[UInt8, ...], network: SuperPoint, arguments: ar
         with torch.no_grad():
             stem = network.encode(torch.from_numpy(seen), 0, arguments.frozen_layers)
             detector = network.detector(network.encode(stem, arguments.frozen_layers))
-        taught = [sample_descriptors(values.float(), keypoints)[0] for values in maps]
-        found.append(Frame(stem, keypoints, taught, detector))
+        taught = [sample_descriptors(values.float(), keypoints)[0].half() for values in maps]
+        found.append(Frame(stem.half(), keypoints, taught, detector.half()))
     return found
 
 
-def distilled(network: SuperPoint, groups: list[list[Frame]], arguments: argparse.Namespace) -> SuperPoint:
-    """The running average of the network in training."""
+def distilled(
+    network: SuperPoint, groups: list[list[Frame]], weights: Float64, arguments: argparse.Namespace
+) -> SuperPoint:
+    """The running average of the network in training; sources are drawn by their weights."""
     rng = np.random.default_rng(arguments.seed)
+    shares = np.where([len(group) > 1 for group in groups], weights, 0.0)
+    shares /= shares.sum()
     trained = [*network.encoder[arguments.frozen_layers :].parameters(), *network.descriptor.parameters()]
     for parameter in trained:
         parameter.requires_grad_(True)
@@ -109,7 +119,7 @@ def distilled(network: SuperPoint, groups: list[list[Frame]], arguments: argpars
     optimiser = torch.optim.AdamW([{"params": trained, "weight_decay": 1e-4}, {"params": [log_scale]}])
     average = deepcopy(network).requires_grad_(False)
     for step in range(arguments.steps):
-        group = groups[int(rng.integers(len(groups)))]
+        group = groups[int(rng.choice(len(groups), p=shares))]
         first = int(rng.integers(len(group)))
         others = [row for row in range(len(group)) if 0 < abs(row - first) <= REACH]
         others = [row for row in others if group[row].stem.shape == group[first].stem.shape]
@@ -133,10 +143,11 @@ def distilled(network: SuperPoint, groups: list[list[Frame]], arguments: argpars
 
 def pair_loss(network: SuperPoint, pair: tuple[Frame, Frame], scale: Tensor, frozen: int) -> Tensor:
     """Divergence from the teachers between the frames and within either, and from the detector that is held."""
-    shared = network.encode(torch.cat([frame.stem for frame in pair]), frozen)
-    maps = network.descriptor(shared).chunk(2)
+    with torch.autocast("cpu", torch.bfloat16, enabled=BFLOAT16):
+        shared = network.encode(torch.cat([frame.stem.float() for frame in pair]), frozen)
+        maps, logits = network.descriptor(shared).float().chunk(2), network.detector(shared).float()
     own = [sample_descriptors(values, frame.keypoints)[0] for values, frame in zip(maps, pair, strict=True)]
-    detector = held_loss(network.detector(shared), torch.cat([frame.detector for frame in pair]))
+    detector = held_loss(logits, torch.cat([frame.detector.float() for frame in pair]))
     between, wanted = scale * own[0] @ own[1].T, similarities(*pair)
     total = detector + divergence(between, wanted) + divergence(between.T, wanted.T)
     for descriptors, frame in zip(own, pair, strict=True):
@@ -148,7 +159,7 @@ def pair_loss(network: SuperPoint, pair: tuple[Frame, Frame], scale: Tensor, fro
 
 def similarities(a: Frame, b: Frame) -> Tensor:
     """(N, M) of the teachers, in the mean."""
-    each = [first @ second.T for first, second in zip(a.taught, b.taught, strict=True)]
+    each = [first.float() @ second.float().T for first, second in zip(a.taught, b.taught, strict=True)]
     return SCALE * torch.stack(each).mean(dim=0)
 
 

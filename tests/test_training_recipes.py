@@ -4,17 +4,26 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from argparse import Namespace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 import yaml
 
 pytest.importorskip("torch", reason="training needs the extra `train`")
 
+import torch
+
 from improvo import config
+from improvo.frontend.runtime_torch import load_network
+from improvo.frontend.weights import DataSource, find_weights, load_weights
 from improvo.training.held_settings import HeldSettings
+from improvo.training.pack import write_pack
+from improvo.training.pictures import Pictures, Source
 from improvo.training.settings import OdometryTrainingSettings
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -52,11 +61,40 @@ def test_settings_of_a_recipe_are_read(name: str) -> None:
 
 @pytest.mark.parametrize("tiny", [False, True])
 def test_every_job_of_the_plan_has_settings(tiny: bool) -> None:
-    import argparse
-
     plan: dict[str, Any] = yaml.safe_load((RECIPES / "gpu-plan.yaml").read_text())
     for job in plan["jobs"]:
-        settings = recipe("gpu_train").settings_of(job, plan, argparse.Namespace(tiny=tiny, compile=True))
+        settings = recipe("gpu_train").settings_of(job, plan, Namespace(tiny=tiny, compile=True))
         assert isinstance(settings, HeldSettings)
         assert settings.compile
         assert settings.views.width == (64 if tiny else 320)
+
+
+def test_a_small_network_is_taught_by_a_larger_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    coarse = rng.integers(0, 256, (20, 30), dtype=np.uint8)
+    scene = cv2.resize(coarse, (300, 200), interpolation=cv2.INTER_NEAREST)
+    frames = tuple(np.ascontiguousarray(scene[:120, shift : shift + 160]) for shift in (0, 6, 12, 18))
+    licence = DataSource("drawn squares", "CC0 1.0", "nobody")
+    pack, output = tmp_path / "pack.zip", tmp_path / "taught.safetensors"
+    write_pack(pack, Pictures((Source("squares", frames, ("",) * 4, 1.0),)), [], [licence], quality=95)
+    monkeypatch.setattr("sys.argv", ["distil", str(pack), "-o", str(output), "--steps", "40", "--seed", "3"])
+    distil = recipe("distil")
+    distil.main()
+
+    before, after = load_weights(find_weights("superpoint-small")), load_weights(output)
+    changed = {name for name, values in after.tensors.items() if not np.array_equal(values, before.tensors[name])}
+    assert {name.split(".convolution")[0].split(".norm")[0] for name in changed} == {
+        "encoder.6", "encoder.7", "descriptor.0", "descriptor.1"
+    }  # fmt: skip
+    assert after.card.training["teachers"] == ["superpoint-vo", "superpoint-small"]
+    assert after.card.training["frames"] == 4
+    assert licence in after.card.data
+    assert not after.card.activation_ranges, "those of the start no longer hold"
+
+    options = Namespace(start="superpoint-small", teachers=["superpoint-vo", "superpoint-small"], frozen_layers=6)
+    known = distil.known_frames(frames[:2], load_network(before), options)
+    untaught, taught = (
+        float(distil.pair_loss(load_network(weights), tuple(known), torch.tensor(distil.SCALE), 6).detach())
+        for weights in (before, after)
+    )
+    assert taught < 0.9 * untaught

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -36,7 +38,7 @@ class Process:
         return range(self.rank, batch_size, self.world_size)
 
     def join(self, device_type: str) -> None:
-        """Meet the other processes.
+        """Meet the other processes, until this one ends.
 
         Args:
             device_type: "cuda" or "cpu", where the gradients lie.
@@ -45,6 +47,7 @@ class Process:
 
         if self.world_size > 1 and not distributed.is_initialized():
             distributed.init_process_group("nccl" if device_type == "cuda" else "gloo")
+            atexit.register(_leave)
 
     def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
         """Replace each gradient by its mean over all processes.
@@ -68,3 +71,16 @@ class Process:
             from torch import distributed
 
             distributed.barrier()
+
+
+def _leave() -> None:
+    """End the threads that spoke to the other processes, while there is an interpreter that they may use.
+
+    Left to the interpreter's end, they abort it now and then. Graphs of past steps are cycles that hold the group,
+    and its threads end only when nobody holds it.
+    """
+    from torch import distributed
+
+    gc.collect()
+    if distributed.is_initialized():
+        distributed.destroy_process_group()
