@@ -152,3 +152,80 @@ def test_a_run_without_poses_says_why_and_what_helps() -> None:
     assert empty is not None
     assert empty.startswith("no frame has a pose: the run ended before a map could start; ")
     assert why_no_pose({"frames": {"tracked": 3}, "events": []}) is None
+
+
+# --- a second run into the same folder
+
+
+def without_times(folder: Path) -> dict[str, bytes]:
+    """All files but run.json, which tells how long things took."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name not in ("run.json", ".improvo.json")}
+
+
+def words(walk: Path, out: Path, *more: str) -> list[str]:
+    return ["run", str(walk), "-o", str(out), "--frontend", "orb", "--max-keypoints", "200", "--quiet", *more]
+
+
+def test_a_second_run_that_fails_before_its_first_file_leaves_the_first_one(
+    out: Path, walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, report = without_times(out), (out / "run.json").read_bytes()
+
+    def bug(*_: object) -> None:
+        raise RuntimeError("in the middle")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("improvo.odometry.visual_odometry.VisualOdometry.finish", bug)
+        with pytest.raises(RuntimeError, match="in the middle"):
+            main(words(walk, out, "--end", "15"))
+    assert without_times(out) == before
+    assert (out / "run.json").read_bytes() == report
+
+
+@pytest.mark.parametrize("stopped_at", ["improvo.odometry.run.write_map", "improvo.labeling.labeler.write_json"])
+def test_a_second_run_that_is_stopped_between_its_files_is_no_result(
+    out: Path, walk: Path, monkeypatch: pytest.MonkeyPatch, stopped_at: str
+) -> None:
+    """Its tables with the run.json of the first, or labels that nobody has doubted yet, would be taken for one."""
+
+    def stop(*_: object, **__: object) -> None:
+        raise SystemExit("stopped")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stopped_at, stop)
+        with pytest.raises(SystemExit):
+            main(words(walk, out, "--end", "15"))
+    with pytest.raises(InputError, match=r"has no run\.json; give the output folder of `improvo run`"):
+        RunFolder(out)
+    assert main(words(walk, out, "--end", "15")) == 0
+    assert RunFolder(out).frames == 15
+
+
+def test_a_second_run_takes_away_what_it_does_not_write_again(out: Path, walk: Path, tmp_path: Path) -> None:
+    """Depth, a page and a found camera of the first run are not those of the second."""
+    for name in ("depth.zip", "dense.ply", "report.html", "camera.yaml", "camera.json"):
+        (out / name).write_text("of the first run")
+    assert main(words(walk, out)) == 0
+    assert not {"depth.zip", "dense.ply", "report.html", "camera.yaml", "camera.json"} & set(without_times(out))
+    (out / "camera.yaml").write_text((walk / "camera.yaml").read_text())  # the user's own
+    assert main(words(walk, out)) == 0
+    assert (out / "camera.yaml").is_file()
+    (out / "camera.json").write_text("{}")
+    assert main(words(walk, out, "--camera", str(out / "camera.yaml"))) == 0
+    assert (out / "camera.json").is_file()
+
+
+def test_a_file_for_rerun_that_does_not_fit_costs_no_results(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rerun = pytest.importorskip("rerun", reason="needs rerun: pip install 'improvo[view]'")
+
+    def full(*_: object, **__: object) -> None:
+        raise RuntimeError("File-writer thread shut down prematurely")
+
+    monkeypatch.setattr(rerun.RecordingStream, "flush", full)
+    path = tmp_path / "watch.rrd"
+    assert main(words(walk, tmp_path / "out", "--save", str(path))) == 2
+    assert capsys.readouterr().err == f"improvo: {path}: cannot be written (is the disk full?); choose another\n"
+    assert RunFolder(tmp_path / "out").frames == FRAMES
+    assert [entry.name for entry in tmp_path.iterdir()] == ["out"]
