@@ -139,3 +139,21 @@ def test_truth(walk: Path, tmp_path: Path) -> None:
     assert len(statuses) > 1
     assert len((tmp_path / "truth.txt").read_text().splitlines()) > 10
     assert not [path for path in tmp_path.rglob("*") if ".partial" in path.name]
+
+
+def test_demo_that_is_interrupted_in_one_of_its_commands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It says so once, with the status of an interrupt, and the same command again begins with what is there."""
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("improvo.sequences.open_sequence", interrupt)
+        assert main(["demo", "-o", str(tmp_path / "demo"), "--quiet"]) == 130
+    assert capsys.readouterr().err == "improvo: interrupted\n"
+    with monkeypatch.context() as patch:
+        patch.setattr("improvo.cli.demo._do", interrupt)
+        assert main(["demo", "-o", str(tmp_path / "demo"), "--quiet"]) == 130
+    assert capsys.readouterr().err == "improvo: interrupted\n"
