@@ -256,3 +256,24 @@ def test_real_recording(shared_data: Path, tmp_path: Path) -> None:
     assert found.camera.fx == pytest.approx(published.fx, rel=0.015)
     assert found.camera.fy == pytest.approx(published.fy, rel=0.015)
     assert found.focal_deviation < 0.02
+
+
+def test_a_stop_between_a_camera_and_its_figures_leaves_no_camera_of_another_recording(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = counted(monkeypatch)
+    out, other = tmp_path / "out", tmp_path / "other"
+    out.mkdir()
+    shutil.copytree(walk, other)
+    find_cameras([walk], SequenceSettings(camera="auto"), out)
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("improvo.self_calibration.from_motion.write_json", stop)
+        with pytest.raises(KeyboardInterrupt):
+            find_cameras([other], SequenceSettings(camera="auto"), out)
+    assert (out / "camera.yaml").is_file()  # of the other recording
+    find_cameras([walk], SequenceSettings(camera="auto"), out)
+    assert asked == [walk, other, walk]

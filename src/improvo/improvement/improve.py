@@ -91,12 +91,12 @@ def improve(
     first_weights = earlier.first_weights(settings.frontend.name)
     make_output_folder(output, COMMAND)
     with locked(output):
-        folder = ImproveFolder(output, sequences, evaluate, settings, first_weights, after)
-        loop = Rounds(folder, settings, train or _train, data, workers, ray, progress)
         needed = first_estimate(sequences, settings, rounds, evaluate)
         if needed is not None:
             progress.line(f"estimate: {needed.words}")
-            refuse_full_disk(output, needed)
+            refuse_full_disk(output, needed)  # before the settings are recorded, which fewer steps would contradict
+        folder = ImproveFolder(output, sequences, evaluate, settings, first_weights, after)
+        loop = Rounds(folder, settings, train or _train, data, workers, ray, progress)
         split = loop.split(sequences, evaluate, first_weights)
         progress.split(split)
         start = loop.start(first_weights, split.training)
