@@ -81,9 +81,9 @@ class HealthCheck:
                 earlier[view.frame_index - gap], view, self._camera, self._descriptor_distance, self._settings
             )
             two_motions |= found.two_motions
-            enough = found.own_inliers >= max(self._settings.start.min_points, LARGE_PART * found.matches)
-            if enough and found.turn_deg < SAME_TURN_DEG and not found.two_motions:
-                counts[row] = found.map_inliers, found.own_inliers, found.map_tracked, found.own_tracked
+            if found.two_motions or not self._credible(found):
+                continue
+            counts[row] = found.map_inliers, found.own_inliers, found.map_tracked, found.own_tracked
         self._rounds.append(counts)
         self._two_motions = self._two_motions + 1 if two_motions else 0
         if len(self._rounds) < _ROUNDS:
@@ -93,6 +93,18 @@ class HealthCheck:
         # A wall of repeated texture, matched one repetition off, moves rigidly, too; tracks seldom make that mistake.
         confirmed = map_tracked >= max(self._settings.start.min_points, _TRACKED_AGREEMENT * own_tracked)
         return bool(decides and map_inliers < _AGREEMENT * own_inliers and not confirmed)
+
+    def _credible(self, found: Agreement) -> bool:
+        """Whether enough matches agree with the two views' own pose for it to say something of the map.
+
+        One that turned far otherwise comes from repeated texture or a crowd more often than from a wrong map. It
+        counts where most matches agree with it, and tracks do, too, rather than with the map.
+        """
+        least = self._settings.start.min_points
+        if found.turn_deg < SAME_TURN_DEG:
+            return found.own_inliers >= max(least, LARGE_PART * found.matches)
+        most = found.own_inliers >= (1.0 - LARGE_PART) * found.matches
+        return most and found.own_tracked >= least and found.map_tracked < _AGREEMENT * found.own_tracked
 
     @property
     def ambiguous(self) -> bool:

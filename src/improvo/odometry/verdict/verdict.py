@@ -15,7 +15,7 @@ from improvo.types import Float64
 
 _SCALE_SHARE = 40.0  # % of the path that a change of scale by the factor e moves (calibrated: docs/odometry.md)
 _USUAL_NOISE = 0.0016  # share of the picture's width; the estimate grows with noise that is larger
-_USUAL_SHARED = 0.0005  # the same of what neighbours are off by together; in right recordings rarely as much
+_USUAL_SHARED = 0.0007  # the same of what neighbours are off by together: up to 0.0006 by a camera known roughly
 _NOISE_POWER = 3  # noise of 1.4 times the usual one came with 3 to 5 times the spread (docs/robustness-odometry.md)
 _FOCAL_CHANGE = 0.12  # of the logarithm of the focal length, within a window or from one to the next
 _FOCAL_ERROR = 0.2  # of the logarithm of the focal length, from that of the camera as given
