@@ -12,11 +12,11 @@ from __future__ import annotations
 import numpy as np
 
 from improvo.geometry.camera import Camera
+from improvo.odometry.gates import FEWEST
 from improvo.odometry.verdict.evidence_window import EvidenceWindow
 
 _COLUMNS, _ROWS = 16, 12  # cells of the picture: about as large as a person's trunk or arm
 _OUTLIER = 5.0  # times the median error: an observation so far off says nothing of its neighbours
-_FEW = 30  # observations with a neighbour; fewer tell nothing
 
 
 def shared_error(window: EvidenceWindow, camera: Camera) -> float:
@@ -39,7 +39,7 @@ def shared_error(window: EvidenceWindow, camera: Camera) -> float:
         (window.camera[rows] * _ROWS + row) * _COLUMNS + column, return_inverse=True, return_counts=True
     )
     several = count > 1
-    if count[several].sum() < _FEW:
+    if count[several].sum() < FEWEST:
         return 0.0
     sums = np.stack([np.bincount(cell, residuals[:, axis]) for axis in (0, 1)], axis=1)
     squares = np.bincount(cell, (residuals**2).sum(axis=1))
