@@ -27,7 +27,7 @@ from improvo.types import Int64
 _GAPS = (3, 6, 12)  # frames between the two views of a check
 _ROUNDS = 3  # consecutive checks that are evaluated together
 _AGREEMENT = 0.85  # share of the two views' own inliers that fit the map: right maps stay over 0.90, wrong under 0.80
-_TRACKED_AGREEMENT = 0.9  # of those that are tracked, too: so many speak for the map, whatever the others agree on
+_TRACKED_AGREEMENT = 0.95  # of those that are tracked, too: so many speak for the map, whatever the others agree on
 
 
 @dataclass(frozen=True)
