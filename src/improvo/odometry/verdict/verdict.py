@@ -15,6 +15,7 @@ from improvo.types import Float64
 
 _SCALE_SHARE = 40.0  # % of the path that a change of scale by the factor e moves (calibrated: docs/odometry.md)
 _USUAL_NOISE = 0.0016  # share of the picture's width; the estimate grows with noise that is larger
+_USUAL_SHARED = 0.0007  # the same of what neighbours are off by together: up to 0.0006 by a camera known roughly
 _NOISE_POWER = 3  # noise of 1.4 times the usual one came with 3 to 5 times the spread (docs/robustness-odometry.md)
 _FOCAL_CHANGE = 0.12  # of the logarithm of the focal length, within a window or from one to the next
 _FOCAL_ERROR = 0.2  # of the logarithm of the focal length, from that of the camera as given
@@ -110,13 +111,15 @@ def estimated_error(spread: Spread) -> float:
 
     The root sum of squares of what the paths of the parts differ by, and of what the least certain change of scale
     moves. Of the two halves of the points the better one counts twice: the other can have too few by chance. Unusual
-    noise is worse than its spread: what does not fit is dropped, so what stays agrees with what is wrong.
+    noise is worse than its spread: what does not fit is dropped, so what stays agrees with what is wrong. So is what
+    neighbours are off by together, which is no noise of keypoints at all: the map follows several motions.
     """
     noise = np.nan_to_num(spread.noise_px) / (_USUAL_NOISE * spread.width)
+    shared = spread.shared_px / (_USUAL_SHARED * spread.width)
     quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
     scale = _SCALE_SHARE * float(_scale_errors(spread).max(initial=0.0))
     spreads = (quarters**2).sum() + len(HALVES) * halves.min() ** 2 + scale**2
-    return float(max(noise, 1.0) ** _NOISE_POWER * np.sqrt(spreads))
+    return float(max(noise, shared, 1.0) ** _NOISE_POWER * np.sqrt(spreads))
 
 
 def _scale_errors(spread: Spread) -> Float64:
@@ -154,9 +157,9 @@ def _told(first: int, last: int, words: str) -> str:
 def _uncertain(spread: Spread) -> tuple[tuple[int, int], ...]:
     """Stretches (first and last frame) across which the parts of the evidence disagree about the scale."""
     found: list[tuple[int, int]] = []
-    for first, last in spread.link_frames[_scale_errors(spread) >= SAME_SCALE].tolist():
+    for first, last in sorted(spread.link_frames[_scale_errors(spread) >= SAME_SCALE].tolist()):
         if found and first <= found[-1][1]:
-            found[-1] = (found[-1][0], last)
+            found[-1] = (found[-1][0], max(last, found[-1][1]))
         else:
             found.append((first, last))
     return tuple(found)
@@ -169,6 +172,8 @@ def _in_words(spread: Spread, error: float) -> str:
     words = f"estimated error {error:.1f} % of the path: "
     if spread.noise_px > 1.5 * _USUAL_NOISE * spread.width:
         words += f"the points are {spread.noise_px:.1f} pixels off, and "
+    if spread.shared_px > 1.25 * _USUAL_SHARED * spread.width:
+        words += f"parts of the picture are off by {spread.shared_px:.2f} pixels together, and "
     scale = float(_scale_errors(spread).max(initial=0.0))
     if _SCALE_SHARE * scale > float(np.linalg.norm(spread.error_percent)):
         first, last = spread.link_frames[int(np.argmax(_scale_errors(spread)))].tolist()
