@@ -134,7 +134,7 @@ def test_why_no_recording_can_be_opened_is_said(tmp_path: Path, capsys: pytest.C
     playlist = tmp_path / "list.mp4"
     playlist.write_text("ffconcat version 1.0\nfile other.mp4\n")
     assert main(["label", "--plan", str(playlist), str(tmp_path / "empty")]) == 2
-    assert "list.mp4: is a text that names other files" in capsys.readouterr().err
+    assert "list.mp4: is a text, not a video" in capsys.readouterr().err
 
 
 def test_without_a_plan_the_output_must_be_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

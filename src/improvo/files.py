@@ -9,8 +9,10 @@ import re
 import secrets
 import shutil
 import socket
+import sys
 import time
-from collections.abc import Iterator
+import weakref
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +21,7 @@ from improvo import locations
 from improvo.errors import InputError, OutputError
 from improvo.formats import FORMAT, FORMAT_KEY, check_format
 from improvo.locations.place import MARKER as MARKER  # of a folder that a command of ours has made
-from improvo.untrusted.paths import check_path
+from improvo.untrusted.paths import check_path, is_text
 from improvo.untrusted.text import load_json
 
 if TYPE_CHECKING:
@@ -32,6 +34,20 @@ _HOST = hashlib.sha256(socket.gethostname().encode()).hexdigest()[:6]
 _FOREIGN_SECONDS = 86400.0  # after which a temporary file of another machine is of a process that ended
 _LONGEST_NAME = 100  # characters of a name that go into that of its temporary file
 _open_here: set[str] = set()  # names of temporary files and folders that this process is writing
+_sources: weakref.WeakKeyDictionary[object, Path] = weakref.WeakKeyDictionary()  # reader -> the file that it reads
+
+
+def never_replace(path: Path, reader: object) -> None:
+    """No output may replace this file as long as `reader` is there: nobody has a second copy of a recording."""
+    _sources[reader] = path.absolute()
+
+
+def is_same_file(one: Path, other: Path) -> bool:
+    """Whether both are there, and the same."""
+    try:
+        return one.samefile(other)
+    except (OSError, ValueError):
+        return False
 
 
 @contextmanager
@@ -40,6 +56,8 @@ def written_atomically(path: Path) -> Iterator[Path]:
 
     The folder is made where it is missing, so that nothing needs to be made before there is something to write.
     """
+    if any(is_same_file(path, source) for source in list(_sources.values())):
+        raise OutputError(f"{path}: is being read, and the output would replace it; choose another name")
     temporary = path.with_name(temporary_name(path.name, path.suffix))
     made = False
     try:
@@ -139,9 +157,12 @@ def write_picture(path: Path, image: NDArray[np.uint8]) -> None:
     import cv2
 
     with written_atomically(path) as temporary:
-        encoded, data = cv2.imencode(path.suffix, image)
+        try:
+            encoded, data = cv2.imencode(path.suffix, image)
+        except cv2.error:  # no such format
+            encoded = False
         if not encoded:
-            raise OutputError(f"{path}: cannot be written; choose another folder")
+            raise OutputError(f"{path}: pictures cannot be written as '{path.suffix}'; name it .png or .jpg")
         temporary.write_bytes(data.tobytes())
 
 
@@ -168,15 +189,22 @@ def check_output_folder(path: Path, command: str) -> None:
         raise OutputError(f"{path}: no permission to write in {existing}; choose another output folder")
 
 
-def check_output_file(path: Path) -> None:
+def check_output_file(path: Path, suffixes: Collection[str] = ()) -> None:
     """Refuse a file that cannot be written, before any work is done.
 
+    Args:
+        path: of the file.
+        suffixes: of files of its kind, with their dots. What exists under another is not replaced.
+
     Raises:
-        OutputError: it is a folder, lies in a file, has an impossible name, or there is no permission.
+        OutputError: it is a folder, lies in a file, has an impossible name, is of another kind, or there is no
+            permission.
     """
     _check_name(path)
     if path.is_dir():
         raise OutputError(f"{path}: is a folder; give the name of a file in it")
+    if suffixes and path.exists() and path.suffix.lower() not in suffixes:
+        raise OutputError(f"{path}: exists, and is no {' or '.join(suffixes)} file to be replaced; choose another name")
     existing = next(parent for parent in path.absolute().parents if parent.exists())
     if not existing.is_dir():
         raise OutputError(f"{path}: {existing} is a file, not a folder; choose another folder")
@@ -189,6 +217,8 @@ def _check_name(path: Path) -> None:
         check_path(path)
     except InputError as error:
         raise OutputError(str(error)) from None
+    if not is_text(path):  # tables and networks are written by libraries that take nothing else
+        raise OutputError(f"{path}: the name is no text here (encoding {sys.getfilesystemencoding()}); choose another")
 
 
 def make_output_folder(path: Path, command: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Collection, Iterator
@@ -11,12 +12,33 @@ from typing import Any, TextIO, TypeVar
 T = TypeVar("T")
 
 INTERVAL = 20.0  # seconds between two lines, where there is no terminal
+_CONTROLS = {*range(0x20), *range(0x7F, 0xA0)} - {ord("\t"), ord("\n")}
+_DIRECTIONS = {0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A)}  # turn the text around
+_SHOWN = {code: repr(chr(code))[1:-1] for code in _CONTROLS | _DIRECTIONS}
 _quiet = False
 
 
 def counted(count: int, unit: str) -> str:
     """`1 frame`, `2 frames`."""
     return f"{count} {unit}" if count == 1 else f"{count} {unit}s"
+
+
+def tell(line: str, stream: TextIO) -> None:
+    """Print a line about work that goes on whether or not anybody listens, as behind `| head -1`."""
+    try:
+        print(line, file=stream, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def printable(text: str) -> str:
+    """A text with what a terminal would obey rather than show written as `\\x1b`: names of files may hold anything."""
+    return text.translate(_SHOWN)
+
+
+def one_line(text: str) -> str:
+    """As `printable`, with line breaks written as `\\n`, too."""
+    return printable(text.replace("\n", "\\n"))
 
 
 @contextmanager
@@ -135,7 +157,7 @@ class _Lines(Progress):
             self._began, self._first = now, self._done
         if now - self._said >= INTERVAL:
             self._said = now
-            print(self._text(now - self._began), file=self._stream, flush=True)
+            tell(self._text(now - self._began), self._stream)
 
     def describe(self, words: str) -> None:
         self._words = words

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from improvo.cli.flags import add_setting
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, recording_path, settings_from
-from improvo.cli.output import figures, next_step, notice, say
+from improvo.cli.output import figures, next_step, notice, say, typed
 from improvo.errors import ConfigError, InputError
 from improvo.files import check_output_file
 from improvo.self_calibration.settings import SelfCalibrationSettings
@@ -78,18 +78,19 @@ def run(arguments: argparse.Namespace) -> None:
         raise ConfigError("--from motion needs no board; leave out --board and --print-board")
     board = parse_board(arguments.board or _BOARD)
     if arguments.print_board is not None:
+        check_output_file(arguments.print_board, (".pdf",))
         print_board(board, arguments.print_board, arguments.paper)
         say(f"{arguments.print_board}: print it at 100 %, check the ruler, glue it to something flat")
         return
     if arguments.recording is None:
         raise ConfigError("give a video, or --print-board FILE.pdf to make a board for one")
     settings = settings_from(SelfCalibrationSettings, arguments)
-    check_output_file(arguments.output)
+    check_output_file(arguments.output, (".yaml", ".yml"))
     if arguments.source == "board" or (arguments.source is None and arguments.board is not None):
         _from_board(arguments, settings)
     else:
         _from_motion(arguments, settings)
-    next_step(f"`improvo run VIDEO --camera {arguments.output} -o out`")
+    next_step(f"`improvo run VIDEO --camera {typed(arguments.output)} -o out`")
 
 
 def _from_motion(arguments: argparse.Namespace, settings: SelfCalibrationSettings) -> None:

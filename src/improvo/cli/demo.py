@@ -10,7 +10,7 @@ import argparse
 import shlex
 from pathlib import Path
 
-from improvo.cli.output import next_step, say
+from improvo.cli.output import next_step, say, typed
 from improvo.errors import PLOTS_MISSING, ImprovoError, installed, plots_installed
 
 _STEPS = 300
@@ -51,7 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
     if not installed("torch"):
         say("\nThe rest, where the frontend learns from this room, needs an extra: pip install 'improvo[train]'")
         next_step(
-            f"open {before / 'report.html'}, or install the extra and run `improvo demo -o {arguments.output}` again"
+            f"open {before / 'report.html'}, or install the extra and run `improvo demo -o {typed(arguments.output)}` "
+            "again"
         )
         return 0
     say("\nNow the frontend learns from this room, and is validated on what it never saw; beside it a control.")

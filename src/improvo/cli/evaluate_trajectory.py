@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from improvo.odometry.run_folder import RunFolder
     from improvo.types import Trajectory
 
+_FASTEST = 200.0  # metres a second, beyond which no camera moves
 COMMAND = "evaluate trajectory"
 KITTI_LENGTHS = [100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0]
 TRAJECTORY_FLAGS = {
@@ -88,6 +89,7 @@ def run(arguments: argparse.Namespace) -> int | None:
     if arguments.output is not None:
         check_output_folder(arguments.output, COMMAND)
     estimate, truth, notes = read_pair(arguments.estimate, arguments.against, command.sequence, arguments.truth)
+    notes = (*notes, *_implausible(truth, arguments.against))
     errors = evaluate_trajectory(estimate, truth, settings, (str(arguments.estimate), str(arguments.against)))
     result = {
         "protocol": "trajectory",
@@ -163,6 +165,18 @@ def read_pair(
                 "TUM file"
             )
     return estimate, truth, (*estimate_notes, *truth_notes)
+
+
+def _implausible(truth: Trajectory, path: Path) -> tuple[str, ...]:
+    """A note on true poses whose speed says that they are in other units than metres and seconds."""
+    import numpy as np
+
+    steps = np.linalg.norm(np.diff(truth.camera_centers, axis=0), axis=1)
+    speeds = (steps / np.maximum(np.diff(truth.times), 1e-9))[np.isfinite(steps)]
+    speed = float(np.median(speeds)) if len(speeds) else 0.0
+    if speed <= _FASTEST or (path / "run.json").is_file():
+        return ()
+    return (f"{path}: moves {speed:.3g} m/s; is it in metres and seconds? (millimetres are a thousand times as many)",)
 
 
 def _refuse_without_pose(run: RunFolder) -> None:

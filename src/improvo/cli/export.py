@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from improvo.cli.flags import add_setting
-from improvo.cli.output import figures, next_step, say
+from improvo.cli.output import figures, next_step, say, typed
 from improvo.cli.show_options import add_recording, add_run_folder, target_path
 from improvo.errors import OutputError
 
@@ -82,7 +82,7 @@ def run_nerfstudio(arguments: argparse.Namespace) -> None:
     if len(segments) > 1:
         left = run_folder.frames - len(model.frames)
         say(f"  only the longest of {len(segments)} segments: {left} frames have no pose in its world")
-    next_step(f"`ns-train splatfacto --data {arguments.output}`, with Nerfstudio installed")
+    next_step(f"`ns-train splatfacto --data {typed(arguments.output)}`, with Nerfstudio installed")
 
 
 def add_trajectory_arguments(parser: argparse.ArgumentParser) -> None:
@@ -101,7 +101,7 @@ def run_trajectory(arguments: argparse.Namespace) -> None:
     target = target_path(arguments.output, arguments.output, _FILE_NAMES[arguments.format])
     export_trajectory(run_folder.trajectory, run_folder.frames, target, arguments.format)
     say(f"{target}: {len(run_folder.trajectory)} poses, camera-to-world, in map units")
-    next_step(f"`improvo evaluate trajectory {target} TRUTH` measures them")
+    next_step(f"`improvo evaluate trajectory {typed(target)} TRUTH` measures them")
 
 
 def add_onnx_arguments(parser: argparse.ArgumentParser) -> None:

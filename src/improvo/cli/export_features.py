@@ -18,7 +18,7 @@ from improvo.cli.options import (
     recording_path,
     settings_from,
 )
-from improvo.cli.output import figures, next_step
+from improvo.cli.output import figures, next_step, typed
 from improvo.export.settings import FeatureExportSettings
 
 _LAYOUTS = ("hloc", "colmap")
@@ -83,6 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
             f"image_options=dict(camera_model='PINHOLE', camera_params='{numbers}')"
         )
     else:
-        place = f"{folder / 'database.db'} --image_path {folder / 'images'} --output_path {folder / 'sparse'}"
-        next_step(f"`colmap mapper --database_path {place}`, or pycolmap.incremental_mapping with the same three")
+        database, pictures, sparse = (typed(folder / name) for name in ("database.db", "images", "sparse"))
+        words = f"--database_path {database} --image_path {pictures} --output_path {sparse}"
+        next_step(f"`colmap mapper {words}`, or pycolmap.incremental_mapping with the same three")
     return 0

@@ -21,7 +21,7 @@ from improvo.cli.options import (
     recording_path,
     settings_from,
 )
-from improvo.cli.output import figures, next_step, notice, say
+from improvo.cli.output import figures, next_step, notice, say, typed
 from improvo.cli.plan import say_improve_plan
 from improvo.cli.train_options import add_data_card, read_data_card
 from improvo.errors import ConfigError
@@ -152,7 +152,7 @@ def run(arguments: argparse.Namespace) -> int:
         say(f"control, by homographies alone: right matches {gain}")
     say(f"weights in {result.weights}")
     say(f"report in {arguments.output / 'report.html'}")
-    next_step(f"`improvo run SEQUENCE --frontend {result.weights} -o out` uses them")
+    next_step(f"`improvo run SEQUENCE --frontend {typed(result.weights)} -o out` uses them")
     return 0
 
 

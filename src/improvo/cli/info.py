@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,8 @@ from improvo.cli.options import (
     recording_words,
     settings_from,
 )
-from improvo.cli.output import figures, next_step, say
+from improvo.cli.output import figures, next_step, say, typed
+from improvo.files import check_output_file
 from improvo.sequences.settings import InfoSettings
 
 _CAMERA = ("format", "camera", "fov", "topic")  # options that a run of the same recording needs too
@@ -43,9 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Look at the recording and print what was found."""
+    from improvo.sequences.images import IMAGE_SUFFIXES
     from improvo.sequences.survey import survey
     from improvo.terminal import progress
 
+    if arguments.write_mask is not None:
+        check_output_file(arguments.write_mask, sorted(IMAGE_SUFFIXES))
     settings = with_found_camera(settings_from(InfoSettings, arguments), [arguments.sequence], None, "info")
     with progress("info", "pair") as shown:
         findings = survey(arguments.sequence, settings.sequence, max(1, settings.samples), shown.advance).to_dict()
@@ -54,11 +57,11 @@ def run(arguments: argparse.Namespace) -> None:
     if not findings["problems"]:
         lines.append("nothing wrong was found")
     figures(findings, "\n".join(lines))
-    given = [f" --{name} {shlex.quote(str(vars(arguments)[name]))}" for name in _CAMERA if vars(arguments).get(name)]
+    given = [f" --{name} {typed(vars(arguments)[name])}" for name in _CAMERA if vars(arguments).get(name)]
     options = "".join(given) if findings["camera"] else " --camera FILE"
     if arguments.write_mask is not None:
         say(_write_mask(arguments, settings))
-        options += f" --mask {arguments.write_mask}"
+        options += f" --mask {typed(arguments.write_mask)}"
     next_step(f"`improvo run {recording_words(arguments.sequence)}{options} -o out`")
 
 

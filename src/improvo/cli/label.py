@@ -21,7 +21,7 @@ from improvo.cli.options import (
     recording_path,
     settings_from,
 )
-from improvo.cli.output import figures, next_step, notice, say
+from improvo.cli.output import figures, next_step, notice, say, typed
 from improvo.cli.plan import duration, say_label_plan
 from improvo.errors import ConfigError
 from improvo.odometry.run_settings import LabelRunSettings
@@ -127,8 +127,8 @@ def run(arguments: argparse.Namespace) -> int:
     say(f"{len(done)} of {len(records)} sequences labelled: {stable} stable and {unstable} unstable tracks")
     say(f"labels in {arguments.output}")
     next_step(
-        f"`improvo report {arguments.output}` makes a page of it, "
-        f"`improvo train odometry {arguments.output} -o network` learns from it"
+        f"`improvo report {typed(arguments.output)}` makes a page of it, "
+        f"`improvo train odometry {typed(arguments.output)} -o network` learns from it"
     )
     return 0
 

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import argparse
 import errno
+import io
 import os
 import sys
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
+from itertools import chain
 from pathlib import Path
 from typing import NoReturn
 
 from improvo import __version__, locations
 from improvo.cli import output
 from improvo.cli.commands import COMMANDS, Command
-from improvo.errors import ImprovoError
+from improvo.errors import ImprovoError, OutputError
 from improvo.jobs.interrupts import termination_interrupts
+from improvo.terminal import one_line
 
 _EPILOG = """\
 `improvo VERB --help` shows a command's options with their defaults.
@@ -27,6 +30,7 @@ _OPENCV_PACKAGES = (
     *("opencv-python", "opencv-python-headless"),
     *("opencv-contrib-python", "opencv-contrib-python-headless"),
 )
+_OUTPUTS = {"output", "save", "write_mask", "print_board"}  # arguments that name a file or folder to write
 _NO_MEMORY = "out of memory; give it more, or smaller pictures (--width), fewer keypoints or fewer --workers"
 _NO_FOLDER = "the folder that it runs in was removed; change to another one (cd) and run it again"
 _NO_SPACE = "no space is left on the disk; free some, or choose another folder"
@@ -48,7 +52,7 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the error and exit with status 2."""
-        self.exit(2, f"{self.prog}: {message}; `{self.prog} --help` shows the options\n")
+        self.exit(2, f"{self.prog}: {one_line(message)}; `{self.prog} --help` shows the options\n")
 
 
 class _Text(HelpFormatter, argparse.RawDescriptionHelpFormatter):
@@ -58,11 +62,12 @@ class _Text(HelpFormatter, argparse.RawDescriptionHelpFormatter):
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point. Returns the exit status: 0 done, 2 an error that the user can correct, 130 interrupted."""
     words = list(sys.argv[1:] if argv is None else argv)
+    _make_streams_usable()
     # Descriptors are matched in small products of matrices: threads of OpenBLAS make that slower.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("MPLCONFIGDIR", str(cache_folder() / "matplotlib"))  # made by matplotlib, if it is used
     try:
-        arguments = parser_for(words).parse_args(words)
+        arguments = _parsed(words)
         _check_paths(arguments)
         with output.configured(arguments.quiet, getattr(arguments, "json", False)), termination_interrupts():
             _say_if_opencv_is_there_twice()
@@ -70,14 +75,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             locations.close()
             return status
     except ImprovoError as error:
-        print(f"improvo: {locations.with_urls(str(error))}", file=sys.stderr)
+        print(f"improvo: {one_line(locations.with_urls(str(error)))}", file=sys.stderr)
         locations.close(success=False)
         return 2
     except KeyboardInterrupt:
         locations.close(success=False)
         print("improvo: interrupted", file=sys.stderr)
         return 130
-    except BrokenPipeError:
+    except BrokenPipeError:  # of a command whose result is what it prints
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
@@ -86,6 +91,28 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print(f"improvo: {said}", file=sys.stderr)
         return 2
+
+
+def _make_streams_usable() -> None:
+    """A stream that was closed before the start swallows what is printed; a character it lacks is written `\\xfc`."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - as long as the process
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _parsed(words: list[str]) -> argparse.Namespace:
+    """The arguments; what no option takes is told by the command, not by `improvo`."""
+    parser = parser_for(words)
+    arguments, unknown = parser.parse_known_args(words)
+    if unknown:
+        parser.prog = " ".join(
+            [parser.prog, *(vars(arguments)[name] for name in ("verb", "part") if name in arguments)]
+        )
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+    return arguments
 
 
 def _say_if_opencv_is_there_twice() -> None:
@@ -127,17 +154,31 @@ def _folder_is_gone(error: Exception) -> bool:
 
 
 def _check_paths(arguments: argparse.Namespace) -> None:
-    """Refuse a path that no system can look up, before any command does.
+    """Refuse a path that no system can look up, and an output that is also the input, before any command does.
 
     Raises:
-        InputError: one of them is.
+        InputError: there is such a path.
+        OutputError: there is such an output.
     """
+    from improvo.files import is_same_file
     from improvo.untrusted.paths import check_path
 
-    for value in vars(arguments).values():
-        for item in value if isinstance(value, list | tuple) else [value]:
-            if isinstance(item, Path):
-                check_path(item)
+    paths = {name: _paths(value) for name, value in vars(arguments).items()}
+    for path in chain.from_iterable(paths.values()):
+        check_path(path)
+    for output_name in _OUTPUTS & paths.keys():
+        others = chain.from_iterable(read for name, read in paths.items() if name not in _OUTPUTS)
+        read = [path for path in others if path.is_file()]
+        for path in paths[output_name]:
+            if any(is_same_file(path, other) for other in read):
+                raise OutputError(
+                    f"{path}: is what shall be read, and the output would replace it; choose another name"
+                )
+
+
+def _paths(value: object) -> list[Path]:
+    """The paths in the value of an argument."""
+    return [item for item in (value if isinstance(value, list | tuple) else [value]) if isinstance(item, Path)]
 
 
 def cache_folder() -> Path:

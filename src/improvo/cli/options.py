@@ -9,7 +9,8 @@ from typing import Any, TypeVar
 
 from improvo import config
 from improvo.cli.flags import add_setting
-from improvo.errors import InputError
+from improvo.cli.output import typed
+from improvo.errors import ConfigError, InputError
 from improvo.files import MARKER
 from improvo.presets import preset, presets
 from improvo.sequences.base import SequenceSettings
@@ -91,10 +92,10 @@ def recording_path(text: str) -> Path:
 
 
 def recording_words(path: Path) -> str:
-    """A recording as the user would write it: the bundled one is `demo`, wherever it lies."""
+    """A recording as the user would type it in a command: the bundled one is `demo`, wherever it lies."""
     from improvo.simulation import bundled_sequence
 
-    return "demo" if path == bundled_sequence() else str(path)
+    return "demo" if path == bundled_sequence() else typed(path)
 
 
 def folder_path(text: str) -> Path:
@@ -163,6 +164,10 @@ def settings_from(
     """
     import yaml
 
+    if hasattr(arguments, "camera") and hasattr(arguments, "fov"):
+        raise ConfigError(
+            f"--camera {arguments.camera} and --fov {arguments.fov:g}: both say what the camera is; give one"
+        )
     names = {**getattr(arguments, "flags", {}), **(flags or {})}
     given = [
         f"{setting}={yaml.safe_dump(getattr(arguments, name), default_flow_style=True).splitlines()[0]}"

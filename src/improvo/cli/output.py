@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -45,13 +46,18 @@ def next_after_figures(folder: Path | None) -> None:
     if folder is None:
         next_step("the same with -o OUT keeps the figures, and `improvo report OUT` makes a page of them")
     else:
-        next_step(f"`improvo report {folder}` makes a page of it")
+        next_step(f"`improvo report {typed(folder)}` makes a page of it")
 
 
 def notice(text: str) -> None:
     """A line on stderr about work that takes a while."""
     if not _silent:
-        print(text, file=sys.stderr, flush=True)
+        terminal.tell(terminal.printable(text), sys.stderr)
+
+
+def typed(word: object) -> str:
+    """A path or another word of a command, in quotes where a shell would take it apart or run what is in it."""
+    return shlex.quote(str(word))
 
 
 def figures(data: Any, text: str) -> None:
@@ -69,11 +75,11 @@ def as_json() -> bool:
 
 def _line(text: str) -> None:
     """Print past the progress bars, where there are any."""
-    text = with_urls(text)
+    text = terminal.printable(with_urls(text))
     if "tqdm" not in sys.modules:
-        print(text, flush=True)
+        terminal.tell(text, sys.stdout)
         return
     from tqdm import tqdm
 
     with tqdm.external_write_mode():
-        print(text, flush=True)
+        terminal.tell(text, sys.stdout)

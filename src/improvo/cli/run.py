@@ -21,7 +21,7 @@ from improvo.cli.options import (
     recording_words,
     settings_from,
 )
-from improvo.cli.output import figures, next_step, notice, say
+from improvo.cli.output import figures, next_step, notice, say, typed
 from improvo.depth.run_settings import DenseRunSettings
 from improvo.errors import InputError
 from improvo.odometry.scale.settings import USAGE, scale_settings
@@ -117,10 +117,11 @@ def _tracked(arguments: argparse.Namespace, sequence: Sequence, settings: DenseR
         from improvo.report.pages import write_report
 
         write_report(arguments.output, arguments.output / "report.html")
-        next_step(f"open {arguments.output / 'report.html'}, or draw `improvo show labels {arguments.output}`")
+        next_step(f"open {arguments.output / 'report.html'}, or draw `improvo show labels {typed(arguments.output)}`")
     elif summary.tracked:
         next_step(
-            f"`improvo report {summary.folder}` makes a page of it, `improvo show map {summary.folder}` a picture"
+            f"`improvo report {typed(summary.folder)}` makes a page of it, "
+            f"`improvo show map {typed(summary.folder)}` a picture"
         )
     else:
         next_step(f"`improvo info {recording_words(arguments.sequence)}` looks for what is wrong with the recording")

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from improvo.cli.output import next_step, say
+from improvo.cli.output import next_step, say, typed
 from improvo.cli.show_options import (
     add_frames,
     add_palette,
@@ -42,7 +42,7 @@ def run_map(arguments: argparse.Namespace) -> None:
     target = target_path(arguments.output, arguments.folder / "pictures", "map.png")
     draw_map(run_folder, target, palette(arguments.palette), arguments.last)
     say(str(target))
-    next_step(f"open it, or `improvo report {arguments.folder}` for a page with all pictures")
+    next_step(f"open it, or `improvo report {typed(arguments.folder)}` for a page with all pictures")
 
 
 def add_frames_arguments(parser: argparse.ArgumentParser) -> None:
@@ -73,7 +73,7 @@ def run_frames(arguments: argparse.Namespace) -> None:
     frames = asked_frames(arguments, run_folder.frames)
     folder = arguments.folder / "pictures"
     write_pictures(arguments, folder, frames, lambda frame: painter(run_folder, frame), recorded_fps(run_folder))
-    next_step(f"open it, or `improvo report {arguments.folder}` for a page with all pictures")
+    next_step(f"open it, or `improvo report {typed(arguments.folder)}` for a page with all pictures")
 
 
 def add_live_arguments(parser: argparse.ArgumentParser) -> None:
@@ -97,7 +97,7 @@ def run_live(arguments: argparse.Namespace) -> None:
     show_run(run_folder, arguments.output, palette(arguments.palette), images=not arguments.no_images)
     if arguments.output:
         say(str(arguments.output))
-        next_step(f"`rerun {arguments.output}` opens it")
+        next_step(f"`rerun {typed(arguments.output)}` opens it")
 
 
 def add_accuracy_arguments(parser: argparse.ArgumentParser) -> None:
@@ -122,4 +122,4 @@ def run_accuracy(arguments: argparse.Namespace) -> None:
             target = target.with_stem(f"{target.stem}-{estimator}")
         draw_pose_curves(results, estimator, target)
         say(str(target))
-    next_step(f"open it, or `improvo report {arguments.folder}` for a page with the tables")
+    next_step(f"open it, or `improvo report {typed(arguments.folder)}` for a page with the tables")

@@ -9,7 +9,7 @@ from typing import Any
 
 from improvo.cli.flags import add_setting
 from improvo.cli.options import add_config_arguments, settings_from
-from improvo.cli.output import figures, next_step
+from improvo.cli.output import figures, next_step, typed
 from improvo.simulation.settings import SimulationSettings
 
 
@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> None:
     from improvo.simulation.generate import simulate, simulate_many
     from improvo.terminal import progress
 
-    settings = _settings(arguments)
+    settings, place = _settings(arguments), typed(arguments.output)
     check_output_folder(arguments.output, "simulate")
     common: dict[str, Any] = {"jpeg_quality": arguments.jpeg, "depth_every": arguments.depth_every}
     measures = {name: getattr(settings, name) for name in ("frames", "width", "height", "fps", "fov", "seed")}
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> None:
             {"folders": [str(arguments.output)], **measures},
             f"{arguments.output}: {settings.frames} frames of {settings.width}x{settings.height}, seed {settings.seed}",
         )
-        next_step(f"`improvo run {arguments.output} -o out`, `improvo evaluate trajectory out {arguments.output}`")
+        next_step(f"`improvo run {place} -o out`, `improvo evaluate trajectory out {place}`")
         return
     with progress("simulate", "scene", arguments.scenes) as shown:
         folders = simulate_many(
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
         {"folders": [str(folder) for folder in folders], **measures},
         f"{arguments.output}: {len(folders)} recordings, {folders[0].name} to {folders[-1].name}",
     )
-    next_step(f"`improvo label {arguments.output}/* -o labels`")
+    next_step(f"`improvo label {place}/* -o labels`")
 
 
 def _settings(arguments: argparse.Namespace) -> SimulationSettings:

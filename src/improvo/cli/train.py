@@ -6,6 +6,7 @@ import argparse
 
 from improvo.cli.flags import add_setting
 from improvo.cli.options import read_folder_path, settings_from
+from improvo.cli.output import typed
 from improvo.cli.train_options import (
     add_data_card,
     add_training_arguments,
@@ -37,7 +38,9 @@ def run_shapes(arguments: argparse.Namespace) -> None:
 
     metrics = train_shapes(settings, arguments.output, starting_weights(arguments.parent))
     weights = arguments.output / "weights.safetensors"
-    print_metrics(arguments.output, metrics, f"`improvo train homographies PICTURES --detector {weights} -o network`")
+    print_metrics(
+        arguments.output, metrics, f"`improvo train homographies PICTURES --detector {typed(weights)} -o network`"
+    )
 
 
 def add_homographies_arguments(parser: argparse.ArgumentParser) -> None:
@@ -79,7 +82,7 @@ def run_homographies(arguments: argparse.Namespace) -> None:
         on_pictures=say_skipped,
     )
     weights = arguments.output / "weights.safetensors"
-    print_metrics(arguments.output, metrics, f"`improvo run SEQUENCE --frontend {weights} -o out` uses them")
+    print_metrics(arguments.output, metrics, f"`improvo run SEQUENCE --frontend {typed(weights)} -o out` uses them")
 
 
 def add_odometry_arguments(parser: argparse.ArgumentParser) -> None:
@@ -119,6 +122,6 @@ def run_odometry(arguments: argparse.Namespace) -> None:
     print_metrics(
         arguments.output,
         metrics,
-        f"`improvo run SEQUENCE --frontend {weights} -o out` uses them, `improvo evaluate pose SEQUENCE --frontend "
-        f"{weights} --frontend {arguments.parent}` compares",
+        f"`improvo run SEQUENCE --frontend {typed(weights)} -o out` uses them, `improvo evaluate pose SEQUENCE "
+        f"--frontend {typed(weights)} --frontend {typed(arguments.parent)}` compares",
     )

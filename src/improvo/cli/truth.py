@@ -20,7 +20,7 @@ from improvo.cli.options import (
     recording_words,
     settings_from,
 )
-from improvo.cli.output import figures, next_step
+from improvo.cli.output import figures, next_step, typed
 from improvo.evaluation.truth.settings import CALIBRATE, TruthCommandSettings, TruthSettings
 
 _FLAGS = {"calibrate": "truth.calibrate", "max_features": "truth.max_features", "seed": "truth.seed"}
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     settings = settings_from(TruthCommandSettings, arguments, _FLAGS)
     load_pycolmap()  # said before any work
-    check_output_file(arguments.output)
+    check_output_file(arguments.output, (".txt",))
     settings = with_found_camera(settings, [arguments.sequence], None, "truth")
     sequence = open_sequence(arguments.sequence, settings.sequence)
     with terminal.stages("step") as told:
@@ -76,5 +76,6 @@ def run(arguments: argparse.Namespace) -> int:
             progress=told,
         )
     figures(asdict(quality), f"{arguments.output}: {quality.text()}")
-    next_step(f"`improvo evaluate trajectory OUT {recording_words(arguments.sequence)} --truth {arguments.output}`")
+    recording = recording_words(arguments.sequence)
+    next_step(f"`improvo evaluate trajectory OUT {recording} --truth {typed(arguments.output)}`")
     return 0

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from improvo.cli.output import next_step, say
+from improvo.cli.output import next_step, say, typed
 from improvo.errors import InputError, OutputError
 from improvo.types import UInt8
 
@@ -75,7 +75,7 @@ def run_import(arguments: argparse.Namespace) -> None:
             "non-commercial research only; read your file's own terms before you use or pass on the result, and "
             "record them with --licence."
         )
-    next_step(f"`improvo run SEQUENCE --frontend {output} -o out` uses them")
+    next_step(f"`improvo run SEQUENCE --frontend {typed(output)} -o out` uses them")
 
 
 def run_export(arguments: argparse.Namespace) -> None:
@@ -140,7 +140,7 @@ def run_calibrate(arguments: argparse.Namespace) -> None:
         names = ", ".join(str(path) for path in unreadable[:5])
         say(f"skipped {len(unreadable)} pictures that cannot be read: {names}")
     say(f"{output}: activation ranges over {len(paths) - len(unreadable)} pictures")
-    next_step(f"`improvo run SEQUENCE --frontend {output} -o out` runs them in int8")
+    next_step(f"`improvo run SEQUENCE --frontend {typed(output)} -o out` runs them in int8")
 
 
 def run_show(arguments: argparse.Namespace) -> None:

@@ -100,8 +100,11 @@ def read_public_file(path: Path) -> dict[str, NDArray[Any]]:
     except (MissingExtraError, InputError):
         raise
     except Exception as error:  # torch and safetensors raise many kinds, from RuntimeError to UnpicklingError
+        told = reason(error)
+        if type(error).__name__ == "UnpicklingError":  # torch advises to load it without refusing anything
+            told = "no torch file, or one with more than tensors"
         mend = "save its state_dict alone"
-        raise InputError(f"{path}: not readable as a file of tensors ({reason(error)}); {mend}") from None
+        raise InputError(f"{path}: not readable as a file of tensors ({told}); {mend}") from None
 
 
 def _check_torch_file(path: Path) -> None:

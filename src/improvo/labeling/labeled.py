@@ -128,7 +128,7 @@ def read_labels(folder: Path) -> list[LabeledSequence]:
         settings = config.from_dict(SequenceSettings, values["sequence"], where=str(folder / SETTINGS_FILE))
         rule = config.from_dict(LabelSettings, values["labels"], where=str(folder / SETTINGS_FILE))
     except (KeyError, TypeError):
-        raise InputError(f"{folder}: is no label store; `improvo label SEQUENCE... -o {folder}` makes one") from None
+        raise InputError(f"{folder}: is no label store; `improvo label SEQUENCE... -o LABELS` makes one") from None
     done = [record for record in records if record.state == DONE]
     if not done:
         raise InputError(f"{folder}: has no labelled sequence; see the reasons with `improvo label`, and run it again")

@@ -12,11 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from improvo.errors import ConfigError, InputError
+from improvo.files import never_replace
 from improvo.sequences.association import poses_at
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
+from improvo.sequences.images import IMAGE_SUFFIXES
 from improvo.sequences.live import LiveStream, is_live
 from improvo.sequences.live_sequence import LiveSequence
 from improvo.sequences.sequence import Sequence, selected
+from improvo.sequences.video_codec import has_sound_alone
 from improvo.types import Trajectory
 from improvo.untrusted.paths import check_path
 
@@ -81,7 +84,10 @@ def open_recording(path: Path | str, settings: SequenceSettings | None = None, *
     if settings.fps is not None and not settings.fps > 0:
         raise InputError(f"{path}: fps {settings.fps:g} must be positive")
     try:
-        return _recording(path, settings)
+        recording = _recording(path, settings)
+        if path.is_file():
+            never_replace(path, recording)
+        return recording
     except UnreadableFrameError as error:
         raise InputError(f"{path}: {error}; copy or export the recording again") from None
     except MemoryError:
@@ -101,15 +107,22 @@ def _recording(path: Path, settings: SequenceSettings) -> Recording:
     if settings.format == "auto":
         chosen = next((recording for recording in _formats() if recording.recognises(path)), None)
         if chosen is None:
-            other = _unread_pictures(path)
-            if other is not None:
-                raise InputError(f"{path}: holds {other} files, which are not read; convert them to JPEG or PNG")
-            raise InputError(
-                f"{path}: not recognised as any of {', '.join(format_names())}; name it with --format if it is one"
-            )
+            raise InputError(f"{path}: {_why_unrecognised(path)}")
     else:
         chosen = _format(settings.format)
     return chosen(path, settings)
+
+
+def _why_unrecognised(path: Path) -> str:
+    """What is wrong with a path that no reader takes, and what to do."""
+    if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:
+        return "is a single picture; give the folder that holds all pictures of the recording"
+    if path.is_file() and has_sound_alone(path):
+        return "holds sound, and no pictures; give the video"
+    other = _unread_pictures(path)
+    if other is not None:
+        return f"holds {other} files, which are not read; convert them to JPEG or PNG"
+    return f"not recognised as any of {', '.join(format_names())}; name it with --format if it is one"
 
 
 def _unread_pictures(path: Path) -> str | None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
+from improvo.geometry.camera_files import check_field_of_view
 from improvo.types import Float32, Float64, UInt8
 
 MAX_FOV = 120.0  # degrees of the wider side, where nothing else is asked for
@@ -33,8 +34,8 @@ class Rectifier:
     """
 
     def __init__(self, raw: Camera, width: int | None = None, fov: float | None = None) -> None:
-        if fov is not None and not 1.0 <= fov < 179.0:
-            raise InputError(f"--undistorted-fov {fov:g}: must be between 1 and 179 degrees")
+        if fov is not None:
+            check_field_of_view(fov, "--undistorted-fov")
         self.raw = raw
         self.zoom = 1.0
         self._widest = 1.0

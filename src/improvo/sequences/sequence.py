@@ -20,6 +20,7 @@ from improvo.sequences.rates import AUTO, given_calibration, recording_name
 from improvo.sequences.rectification import Rectifier
 from improvo.types import Float32, Float64, Frame, Int64, Mask, Trajectory, UInt8
 
+_MOST_ENLARGED = 4  # times that --width may make pictures wider
 _PROBES = 20  # frames tried for the image size before a recording counts as unreadable
 
 
@@ -50,6 +51,11 @@ class Sequence:
         self._raw_size = (width, height)
         if settings.width is not None and settings.width < 8:
             raise InputError(f"{self.path}: width {settings.width} is too small; choose at least 8 pixels")
+        if settings.width is not None and settings.width > _MOST_ENLARGED * width:
+            raise InputError(
+                f"{self.path}: width {settings.width} is more than {_MOST_ENLARGED} times that of its pictures; "
+                f"they are {width} wide, and show no more when they are larger"
+            )
         calibration = _calibration(recording, settings, width, height)
         self._rectifier = Rectifier(calibration.camera(width, height), settings.width, settings.undistorted_fov)
         self._masks = SequenceMasks(settings.mask, recording, self.name, self._rectifier) if settings.mask else None

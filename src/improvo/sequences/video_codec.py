@@ -43,6 +43,8 @@ def why_unreadable(path: Path) -> str:
             f"its codec, {codec}, cannot be decoded here (or the file is cut short); convert it: ffmpeg -i "
             f"{path.name} -c:v libx264 -crf 16 converted.mp4"
         )
+    if has_sound_alone(path):
+        return "holds sound, and no pictures; give the video"
     if b"moov" not in _ends(path) and path.suffix.lower() in (".mp4", ".mov", ".m4v", ".3gp"):
         return "has no index, so the recording was cut off before its end; copy it again, or repair it"
     return "cannot be opened as a video (truncated, or a codec that is not known); copy it again or convert it"
@@ -56,6 +58,15 @@ def video_codec(path: Path) -> str | None:
         return _NAMES[match.group(1)]
     found = _MATROSKA.search(data) if data.startswith(b"\x1aE\xdf\xa3") else None
     return None if found is None else _NAMES.get(found.group(0), found.group(0).decode()[2:])
+
+
+def has_sound_alone(path: Path) -> bool:
+    """Whether a file is a recording of sound (WAV, MP3, FLAC, Ogg, or an MP4 without a track of pictures)."""
+    data = _ends(path)
+    if data.startswith((b"ID3", b"fLaC", b"\xff\xfb")) or (data.startswith(b"RIFF") and data[8:12] == b"WAVE"):
+        return True
+    tracks = set(re.findall(rb"hdlr.{8}(soun|vide)", data, re.DOTALL))
+    return tracks == {b"soun"}
 
 
 def is_script(path: Path) -> bool:

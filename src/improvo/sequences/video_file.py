@@ -63,7 +63,7 @@ class VideoFile(Recording):
         if path.stat().st_size == 0:
             raise InputError(f"{path}: the file is empty; copy the video again")
         if is_script(path):
-            raise InputError(f"{path}: is a text that names other files, not a video; give the videos themselves")
+            raise InputError(f"{path}: is a text, not a video; if it names other files, give the videos themselves")
         self._position = -1  # frame that the decoder stands on
         self._image: UInt8 | None = None  # of `_position`, when it was asked for
         self._end: int | None = None  # where decoding turned out to end, before the last packet

@@ -108,7 +108,10 @@ def _numbered(lines: list[str], path: Path) -> ReferencePoses | None:
     values = np.array(rows[1:], np.float64)
     camera = rows[0]
     if camera[0] <= 0 or not np.isfinite(values).all():
-        raise InputError(f"{path}: its first row is no camera fx fy cx cy k1 k2 p1 p2, or a number is not finite")
+        raise InputError(
+            f"{path}: its first row is neither a pose (quaternion qx qy qz qw of length 1) nor a camera "
+            "fx fy cx cy k1 k2 p1 p2, or a number is not finite; repair the file"
+        )
     frames = values[:, 0].astype(np.int64)
     if (frames != values[:, 0]).any() or (frames < 0).any() or len(np.unique(frames)) < len(frames):
         raise InputError(f"{path}: the first column must hold different frame numbers from 0 on; repair the file")

@@ -4,7 +4,12 @@ Keys that could be distortion, a lens model or an image size are read or refused
 read almost gives a trajectory that is many times worse, and nobody knows why.
 """
 
-from improvo.geometry.camera_files.calibration import Calibration, calibration_yaml, from_field_of_view
+from improvo.geometry.camera_files.calibration import (
+    Calibration,
+    calibration_yaml,
+    check_field_of_view,
+    from_field_of_view,
+)
 from improvo.geometry.camera_files.colmap import colmap_calibration
 from improvo.geometry.camera_files.containers import parse_yaml
 from improvo.geometry.camera_files.loading import camera_of, folder_calibration, load_calibration
@@ -13,6 +18,7 @@ __all__ = [
     "Calibration",
     "calibration_yaml",
     "camera_of",
+    "check_field_of_view",
     "colmap_calibration",
     "folder_calibration",
     "from_field_of_view",

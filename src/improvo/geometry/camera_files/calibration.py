@@ -50,8 +50,9 @@ class Calibration:
             raise InputError(f"{chosen.source}: {error}") from None
         if max(camera.fx, camera.fy) < _RELATIVE * max(width, height):
             raise InputError(
-                f"{chosen.source}: focal lengths {camera.fx:g} and {camera.fy:g} for images of {width}x{height} look "
-                "relative to the picture; multiply them by its sides to have pixels"
+                f"{chosen.source}: focal lengths {camera.fx:g} and {camera.fy:g} for images of {width}x{height} are no "
+                "pixels; if they are relative to the picture, multiply them by its sides, and if they are in "
+                "millimetres, by its width over that of the sensor"
             )
         if not 1 / _MAX_ASPECT <= camera.fx / camera.fy <= _MAX_ASPECT:
             raise InputError(
@@ -73,10 +74,20 @@ def from_field_of_view(fov: float, width: int, height: int) -> Calibration:
     Raises:
         InputError: an angle that no pinhole has.
     """
-    if not 1.0 <= fov < 179.0:
-        raise InputError(f"--fov {fov:g}: must be between 1 and 179 degrees")
+    check_field_of_view(fov, "--fov")
     focal = 0.5 * width / math.tan(math.radians(fov) / 2)
     return Calibration("--fov", (focal, focal, (width - 1) / 2, (height - 1) / 2), size=(width, height))
+
+
+def check_field_of_view(degrees: float, flag: str) -> None:
+    """Refuse an angle that no pinhole camera has, or that is in radians.
+
+    Raises:
+        InputError: it is outside of 4 to 179 degrees. (4 degrees are a lens of 500 mm before 35 mm film.)
+    """
+    if not 4.0 <= degrees < 179.0:
+        radians = f" (if it is in radians: {math.degrees(degrees):.1f} degrees)" if 0.1 <= degrees <= math.pi else ""
+        raise InputError(f"{flag} {degrees:g}: must be between 4 and 179 degrees{radians}")
 
 
 def from_numbers(text: str) -> Calibration:
