@@ -88,11 +88,14 @@ def _set(part: ReferencePart, folder: Path, gaps: tuple[int, ...], most: int) ->
     return Set(f"{part.name} ({folder.name})", part, pairs, geometry)
 
 
-def calibrated(weights: Path, folder: Path, keep: Path) -> Path:
-    """Weights with activation ranges, which all others have: measured on frames that were trained on where missing."""
+def calibrated(name: str, weights: Path, folder: Path, keep: Path) -> Path:
+    """Weights with activation ranges, which all others have: measured on frames that were trained on where missing.
+
+    They are kept under the candidate's name: files of different folders are often called the same.
+    """
     if load_weights(find_weights(str(weights))).card.activation_ranges:
         return weights
-    target = keep / f"{'-'.join(weights.with_suffix('').parts[-2:])}.safetensors"
+    target = keep / f"{name.replace(' ', '-')}.safetensors"
     if not target.is_file():
         write_calibrated(weights, target, calibration_images(read_split(folder / "split.json").training, 24))
     return target
@@ -210,7 +213,7 @@ def main() -> None:
                     file = keep / folder.name / f"{name.replace(' ', '-')}.scores.json"
                     if not file.is_file():
                         file.parent.mkdir(parents=True, exist_ok=True)
-                        file.write_text(json.dumps(shares(chosen, calibrated(path, folder, file.parent))))
+                        file.write_text(json.dumps(shares(chosen, calibrated(name, path, folder, file.parent))))
                     found[name] = json.loads(file.read_text())
                 print(f"\n{chosen.name}: pairs " + ", ".join(f"{name}: {len(p)}" for name, p in chosen.pairs.items()))
                 if arguments.only:
