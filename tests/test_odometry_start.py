@@ -181,3 +181,30 @@ def test_a_tolerance_within_which_a_rotation_explains_the_matches_starts_nothing
     assert isinstance(pair_of(views), InitialPair)
     generous = replace(SETTINGS, tolerance=50.0)
     assert pair_of(views, generous) == InitFailure("too little parallax: a rotation explains the motion")
+
+
+def test_repeated_texture_that_looks_like_a_motion_starts_nothing_where_tracks_only_turn() -> None:
+    """Most matches are one repetition off and say that the camera moved; what was tracked says that it turned."""
+    turned, moved = turning(4)[[0, -1]], moving(12)[[0, -1]]
+    moved[0] = turned[0]
+    turned_views = views_of([observe(room(0), pose, seed=i, limit=120) for i, pose in enumerate(turned)])
+    moved_views = views_of([observe(room(1), pose, seed=i, limit=400) for i, pose in enumerate(moved)])
+    for tracked, word in ((False, InitFailure), (True, InitialPair)):
+        views = []
+        for i, (a, b) in enumerate(zip(turned_views, moved_views, strict=True)):
+            tracks = b.tracks if tracked else 1000 * i + np.arange(len(b))
+            views.append(
+                View(
+                    frame_index=i,
+                    time=i / 30.0,
+                    keypoints=np.concatenate([a.keypoints, b.keypoints]),
+                    descriptors=np.concatenate([a.descriptors, b.descriptors]),
+                    weights=np.ones(len(a) + len(b)),
+                    tracks=np.concatenate([a.tracks, 10_000 + tracks]),
+                    points=np.full(len(a) + len(b), -1, np.int64),
+                )
+            )
+        result = pair_of(views)
+        assert isinstance(result, word), result
+        if isinstance(result, InitFailure):
+            assert result.reason == "too little parallax: a rotation explains the tracks"
