@@ -64,6 +64,13 @@ def unit_of(report: dict[str, Any]) -> str:
     return str(report["scale"]) if report.get("metric") else "up to scale"
 
 
+def metres_per_unit(report: dict[str, Any], segment: int) -> float:
+    """Metres per unit of the odometry in a segment of a run, by its run.json; 1 where the run is up to scale."""
+    known = {each["segment"]: each["metres_per_unit"] for each in (report.get("metric") or {}).get("segments", [])}
+    before = [number for number in sorted(known) if number <= segment] or sorted(known)[:1]
+    return float(known[before[-1]]) if before else 1.0
+
+
 def run_odometry(
     sequence: Sequence,
     folder: Path,
@@ -114,9 +121,11 @@ def run_odometry(
             frontend, sequence.camera, settings.odometry, settings.frontend.use_stability, on_final=final
         )
         visualizer.begin(sequence.camera)
-        processed, interrupted = _track_all(sequence, frontend, odometry, visualizer, progress, seconds)
-        odometry.finish()
-        visualizer.end()
+        try:
+            processed, interrupted = _track_all(sequence, frontend, odometry, visualizer, progress, seconds)
+            odometry.finish()
+        finally:
+            visualizer.end()
         if len(processed) < _MIN_FRAMES and not interrupted:
             raise InputError(f"{sequence.path}: only {len(processed)} of its frames can be read; check the recording")
         _remove_result(folder, settings)
