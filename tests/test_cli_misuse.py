@@ -7,15 +7,21 @@ import shlex
 import subprocess
 import sys
 import wave
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from rendered_walk import write_walk
 
+from improvo import config
+from improvo.cli.commands import settings_class
+from improvo.cli.config import SETTINGS
 from improvo.cli.main import main
 from improvo.cli.output import configured, next_step, notice, say, typed
+from improvo.errors import ConfigError
 from improvo.sequences import open_sequence
 from improvo.terminal import one_line, printable
 
@@ -312,3 +318,44 @@ def test_a_trajectory_without_rotations_is_told(tmp_path: Path, capsys: pytest.C
     assert "neither a pose (quaternion qx qy qz qw of length 1)" in refused(
         ("evaluate", "trajectory", path, path), capsys
     )
+
+
+# --- numbers
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("--seed", "-1"), "seed=-1: must be 0 or more, and less than 4294967296"),
+        (("--seed", "99999999999999999999"), "must be 0 or more, and less than 4294967296"),
+        (("--set", "odometry.tolerance=.inf"), "`odometry.tolerance`: inf is no finite number"),
+        (("--set", "odometry.matching.max_distance=.nan"), "`odometry.matching.max_distance`: nan is no finite number"),
+        (("--fps", "inf"), "`sequence.fps`: inf is no finite number"),
+        (("--fps", "1e-300"), "fps 1e-300 is no number of frames a second"),
+    ],
+)
+def test_numbers_that_mean_nothing(
+    walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], says: str
+) -> None:
+    assert says in refused(("run", walk, "-o", tmp_path / "out", *ORB, *words, "--quiet"), capsys)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", sorted(SETTINGS))
+def test_a_seed_that_no_generator_takes_and_a_number_without_end_are_refused_everywhere(command: str) -> None:
+    cls = settings_class(SETTINGS[command])
+    plain = config.to_dict(cls())
+
+    def names(values: dict[str, Any], kind: type, only: str = "", prefix: str = "") -> Iterator[str]:
+        for name, value in values.items():
+            if isinstance(value, dict):
+                yield from names(value, kind, only, f"{prefix}{name}.")
+            elif type(value) is kind and only in ("", name):
+                yield f"{prefix}{name}"
+
+    for name in names(plain, int, "seed"):
+        with pytest.raises(ConfigError, match="must be 0 or more"):
+            config.load(cls, None, [f"{name}=-1"])
+    for name in names(plain, float):
+        with pytest.raises(ConfigError):
+            config.load(cls, None, [f"{name}=.inf"])
