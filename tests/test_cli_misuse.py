@@ -38,6 +38,14 @@ def video(walk: Path) -> Path:
     return write_video(walk.with_name("walk.mp4"), [cv2.imread(str(path)) for path in sorted(walk.glob("*.png"))])
 
 
+@pytest.fixture(scope="module")
+def finished(walk: Path) -> Path:
+    """A run of the walk."""
+    out = walk.with_name("finished")
+    assert main(["run", str(walk), "-o", str(out), *ORB, "--quiet"]) == 0
+    return out
+
+
 def write_video(path: Path, pictures: list[np.ndarray]) -> Path:
     height, width = pictures[0].shape[:2]
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (width, height))
@@ -204,17 +212,23 @@ def test_an_output_that_is_the_input(
         ("calibrate", "--print-board", "{other}"),
         ("truth", "{video}", "-o", "{other}", "--fov", "60"),
         ("info", "{video}", "--write-mask", "{other}"),
+        ("export", "onnx", "superpoint-small", "-o", "{other}"),
+        ("export", "trajectory", "{run}", "-o", "{other}"),
+        ("report", "{run}", "-o", "{other}"),
+        ("show", "map", "{run}", "-o", "{other}"),
+        ("show", "tracks", "{run}", "-o", "{other}"),
     ],
-    ids=lambda words: words[0] + words[1][:4],
+    ids=lambda words: "-".join(words[:2]).replace("{", "").replace("}", ""),
 )
 def test_a_file_of_another_kind_is_not_replaced(
-    video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
+    video: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
 ) -> None:
-    if words[0] == "truth":
-        pytest.importorskip("pycolmap")
+    for command, package in (("truth", "pycolmap"), ("onnx", "onnx"), ("map", "matplotlib")):
+        if command in words:
+            pytest.importorskip(package)
     other = tmp_path / "holiday.mov"
     other.write_text("precious")
-    told = refused(tuple(word.format(video=video, other=other) for word in words), capsys)
+    told = refused(tuple(word.format(video=video, other=other, run=finished) for word in words), capsys)
     assert told.startswith(f"improvo: {other}: exists, and is no .")
     assert other.read_text() == "precious"
 
@@ -359,3 +373,20 @@ def test_a_seed_that_no_generator_takes_and_a_number_without_end_are_refused_eve
     for name in names(plain, float):
         with pytest.raises(ConfigError):
             config.load(cls, None, [f"{name}=.inf"])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux takes any bytes as a name")
+def test_a_recording_whose_name_is_no_text(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Runs and pages show it with a sign in its place; tables of labels cannot hold it."""
+    room = Path(os.fsdecode(os.fsencode(tmp_path) + b"/room\xff"))
+    room.symlink_to(walk)
+    out = tmp_path / "out"
+    assert main(["run", str(room), "-o", str(out), *ORB, "--quiet"]) == 0
+    assert main(["report", str(out)]) == 0
+    assert "room\ufffd" in (out / "report.html").read_text(encoding="utf-8", errors="replace")
+    other = Path(os.fsdecode(os.fsencode(tmp_path) + b"/hall\xff"))
+    other.mkdir()
+    for path in walk.iterdir():
+        (other / path.name).symlink_to(path)
+    capsys.readouterr()
+    assert "its name is no text" in refused(("label", other, "-o", tmp_path / "labels", *ORB, "--quiet"), capsys)
