@@ -39,6 +39,7 @@ from improvo.files import (
 from improvo.folder_lock import LOCK, BusyError, holder_of, locked, seems_held
 from improvo.locations import lock_files, publish, removed
 from improvo.sequences.given_files import CONTENTS
+from improvo.untrusted.paths import is_text
 from improvo.untrusted.text import read_json_file
 
 MANIFEST_FILE, SETTINGS_FILE, RECORD_FILE = "manifest.parquet", "settings.yaml", "label.json"
@@ -292,6 +293,8 @@ def sequence_names(paths: list[Path], stored: Iterable[SequenceRecord] = ()) -> 
     names: dict[str, Path] = {}
     for path in paths:
         resolved = path.resolve()
+        if not is_text(resolved):
+            raise InputError(f"{path}: its name is no text, which tables of labels cannot hold; rename it")
         if resolved in names.values():
             raise InputError(f"{path}: is given twice")
         known = by_path.get(str(resolved))

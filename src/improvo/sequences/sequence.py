@@ -19,6 +19,7 @@ from improvo.sequences.mask import SequenceMasks
 from improvo.sequences.rates import AUTO, given_calibration, recording_name
 from improvo.sequences.rectification import Rectifier
 from improvo.types import Float32, Float64, Frame, Int64, Mask, Trajectory, UInt8
+from improvo.untrusted.paths import as_text
 
 _MOST_ENLARGED = 4  # times that --width may make pictures wider
 _PROBES = 20  # frames tried for the image size before a recording counts as unreadable
@@ -46,7 +47,7 @@ class Sequence:
         self.settings = settings
         self.path: Path = recording.path
         self.format = recording.format
-        self.name = recording_name(recording.path)
+        self.name = as_text(recording_name(recording.path))
         self._skipped: dict[int, SkippedFrame] = {}
         self._raw_size = (width, height)
         if settings.width is not None and settings.width < 8:
