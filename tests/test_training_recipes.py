@@ -19,7 +19,9 @@ pytest.importorskip("torch", reason="training needs the extra `train`")
 import torch
 
 from improvo import config
+from improvo.frontend.registry import load_frontend
 from improvo.frontend.runtime_torch import load_network
+from improvo.frontend.settings import NetworkOptions
 from improvo.frontend.weights import DataSource, find_weights, load_weights
 from improvo.training.held_settings import HeldSettings
 from improvo.training.pack import write_pack
@@ -98,3 +100,27 @@ def test_a_small_network_is_taught_by_a_larger_one(tmp_path: Path, monkeypatch: 
         for weights in (before, after)
     )
     assert taught < 0.9 * untaught
+
+
+def test_a_head_is_taught_to_a_network_without_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(1)
+    frames = []
+    for _ in range(6):
+        plain = np.full((120, 160), 128, np.uint8)
+        plain[:, 80:] = cv2.resize(rng.integers(0, 256, (12, 8), dtype=np.uint8), (80, 120))
+        frames.append(plain)
+    licence = DataSource("drawn halves", "CC0 1.0", "nobody")
+    pack, output = tmp_path / "pack.zip", tmp_path / "taught.safetensors"
+    write_pack(pack, Pictures((Source("halves", tuple(frames), ("",) * 6, 1.0),)), [], [licence], quality=95)
+    monkeypatch.setattr("sys.argv", ["distil_head", str(pack), "-o", str(output), "--steps", "60"])
+    recipe("distil_head").main()
+
+    before, after = load_weights(find_weights("superpoint-small")), load_weights(output)
+    assert after.architecture.stability
+    assert all(np.array_equal(after.tensors[name], values) for name, values in before.tensors.items())
+    assert after.card.training["stability_from"] == "superpoint-vo"
+    assert licence in after.card.data
+    options = NetworkOptions(precision="float32")
+    taught, teacher = (load_frontend(name, 200, network=options) for name in (str(output), "superpoint-vo"))
+    said, wanted = ([network.stability_map(frame) for frame in frames] for network in (taught, teacher))
+    assert np.abs(np.array(said) - wanted).mean() < 0.1
