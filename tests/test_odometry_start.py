@@ -9,6 +9,7 @@ import pytest
 from simulated_features import CAMERA, World, error_percent, hand_motion, nothing_to_see, observe, room, views_of, wall
 
 from improvo.geometry import se3
+from improvo.odometry.gates import MEMORY_FRAMES
 from improvo.odometry.mapping.initial_pair import InitFailure, InitialPair, initial_pair
 from improvo.odometry.mapping.local_map import LocalMap
 from improvo.odometry.mapping.start import start_map
@@ -68,6 +69,15 @@ def test_the_world_is_the_first_camera_and_the_median_depth_in_it_is_one() -> No
     np.testing.assert_allclose(views[0].cam_from_world, np.eye(4), atol=1e-12)
     depths = local_map.store.xyz[views[0].points[views[0].observed], 2]
     assert np.median(depths) == pytest.approx(1.0)
+
+
+def test_the_memory_of_a_new_map_is_that_of_its_last_frames_in_their_order() -> None:
+    truth = np.concatenate([np.repeat(moving(1), 70, axis=0), moving(30)])
+    views = walk(room(), truth)
+    local_map = started(views)
+    assert [view.frame_index for view in local_map.history] == [view.frame_index for view in views[-MEMORY_FRAMES:]]
+    newest = views[-1]
+    assert (local_map.store.last_seen[newest.points[newest.observed]] == newest.frame_index).all()
 
 
 def test_a_pure_rotation_starts_nothing_and_leaves_nothing() -> None:

@@ -38,6 +38,7 @@ from improvo.files import (
 )
 from improvo.folder_lock import LOCK, BusyError, holder_of, locked, seems_held
 from improvo.locations import lock_files, publish, removed
+from improvo.sequences.given_files import CONTENTS
 from improvo.untrusted.text import read_json_file
 
 MANIFEST_FILE, SETTINGS_FILE, RECORD_FILE = "manifest.parquet", "settings.yaml", "label.json"
@@ -95,7 +96,7 @@ class LabelStore:
         check_output_folder(folder, _COMMAND)
         self.folder = folder
         self._refreshed, self._refresh_seconds = 0.0, 0.0
-        made_with = SettingsRecord(folder / SETTINGS_FILE, kind)
+        made_with = SettingsRecord(folder / SETTINGS_FILE, kind, contents=CONTENTS)
         # failures alone, by a wrong mask, say: nothing is lost by other settings
         relabel = relabel or (bool(made_with.difference(settings)) and self._holds_only_failures())
         if not relabel:

@@ -216,12 +216,7 @@ def selected(recording: Recording, settings: SequenceSettings) -> Int64:
     Raises:
         InputError: impossible settings, or nothing left.
     """
-    if settings.stride < 1:
-        raise InputError(f"{recording.path}: stride {settings.stride} must be at least 1")
-    if settings.max_frames is not None and settings.max_frames < 1:
-        raise InputError(f"{recording.path}: max_frames {settings.max_frames} must be at least 1")
-    if settings.start < 0 or (settings.end is not None and settings.end < 0):
-        raise InputError(f"{recording.path}: start and end count frames from 0 and cannot be negative")
+    refuse_impossible(recording.path, settings)
     count = len(recording)
     end = count if settings.end is None else min(settings.end, count)
     indices = np.arange(settings.start, end, settings.stride, dtype=np.int64)[: settings.max_frames]
@@ -230,6 +225,20 @@ def selected(recording: Recording, settings: SequenceSettings) -> Int64:
             f"{recording.path}: has {count} frames, none of them from {settings.start} to {end}; change start or end"
         )
     return indices
+
+
+def refuse_impossible(path: Path, settings: SequenceSettings) -> None:
+    """Refuse a selection of frames that no recording has.
+
+    Raises:
+        InputError: a stride or a number of frames below 1, or a negative start or end.
+    """
+    if settings.stride < 1:
+        raise InputError(f"{path}: stride {settings.stride} must be at least 1")
+    if settings.max_frames is not None and settings.max_frames < 1:
+        raise InputError(f"{path}: max_frames {settings.max_frames} must be at least 1")
+    if settings.start < 0 or (settings.end is not None and settings.end < 0):
+        raise InputError(f"{path}: start and end count frames from 0 and cannot be negative")
 
 
 def _calibration(recording: Recording, settings: SequenceSettings, width: int, height: int) -> Calibration:
