@@ -26,8 +26,6 @@ GOOD = Spread(
     link_frames=np.array([[0, 20], [10, 30]]),
     noise_px=0.3,
     width=640,
-    fewest=100,
-    keyframes=24,
 )
 
 

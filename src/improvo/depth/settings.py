@@ -91,7 +91,7 @@ class AgreementSettings:
 class CloudSettings:
     """The fused point cloud."""
 
-    voxel: float = 0.006  # side of the cell that gets one point; the first median depth is 1, in metres as well
+    voxel: float = 0.006  # side of the cell that gets one point, as a share of the first median depth
     least: int = 2  # other frames that agree on a point
     least_points: int = 2  # pixels, of any frames, that fall into a cell before it gets its point
 

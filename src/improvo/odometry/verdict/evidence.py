@@ -48,8 +48,6 @@ class Spread:
         link_frames: (L, 2) first and last frame of the keyframes on both sides of each link.
         noise_px: of the observations, standard deviation of one coordinate; NaN where nothing was observed.
         width: of the picture in pixels.
-        fewest: observations that a keyframe has, at least.
-        keyframes: of the segment.
         lens: what the windows say of the focal length.
         shared_px: of the residuals, what neighbours in the picture have in common (`shared_errors.py`).
     """
@@ -59,8 +57,6 @@ class Spread:
     link_frames: Int64
     noise_px: float
     width: int
-    fewest: int
-    keyframes: int
     lens: tuple[LensMeasure, ...] = ()
     shared_px: float = 0.0
 
@@ -107,7 +103,6 @@ class EvidenceCheck:
         self._links: list[tuple[int, int]] = []
         self._lens: list[LensMeasure] = []
         self._lens_due = True  # every other window: those between them share half of their keyframes with each
-        self._fewest = np.iinfo(np.int64).max
 
     def add(self, view: View, cam_from_world: Float64, xyz: Float64) -> None:
         """The next keyframe is final.
@@ -124,7 +119,6 @@ class EvidenceCheck:
         self._pending.append(keyframe)
         self._centers.append(se3.inverse(cam_from_world)[:3, 3])
         self._frames.append(view.frame_index)
-        self._fewest = min(self._fewest, len(rows))
         if len(self._pending) == _WINDOW:
             self._solve_window(xyz)
 
@@ -150,8 +144,6 @@ class EvidenceCheck:
             link_frames=np.array(self._links, np.int64).reshape(-1, 2),
             noise_px=float(np.median(self._errors)) / 1.1774 if self._errors else float("nan"),
             width=self._camera.width,
-            fewest=int(self._fewest),
-            keyframes=len(self._centers),
             lens=tuple(self._lens),
             shared_px=float(np.median(self._shared)) if self._shared else 0.0,
         )
