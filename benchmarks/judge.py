@@ -5,10 +5,11 @@
 
 `OUT` are folders of `improvo improve`: each has a reference run with depth, and what was held back. For every candidate
 the share of right matches (3 and 8 px) of the frames held back, by the reference, and by true poses and depth where the
-recording has them; then, for each recording and gap, the rank correlation (Spearman) of the two over the candidates.
+recording has them, and their number; then, for each recording and gap, and all gaps together, the rank correlation
+(Spearman) of the two over the candidates.
 Candidates are the bundled weights, those given, and, without `--only`, sums and spoiled ones of `superpoint-small`.
-With `--only` it compares, the number of right matches too: every row with the first, with 95 % intervals (bootstrap
-over pairs).
+With `--only` it compares: every row with the first, with 95 % intervals (bootstrap over pairs), and the correlations of
+those given where there are ten and more.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ from judge_candidates import written
 
 LIMITS = (3.0, 8.0)
 KEYPOINTS = 500
+_FEWEST = 10  # candidates whose order says something
 # "judge 90" -> of each pair, the share within each limit, then the number; a share also rises where wrong ones are lost
 Shares = dict[str, list[list[float]]]
 
@@ -88,11 +90,14 @@ def _set(part: ReferencePart, folder: Path, gaps: tuple[int, ...], most: int) ->
     return Set(f"{part.name} ({folder.name})", part, pairs, geometry)
 
 
-def calibrated(weights: Path, folder: Path, keep: Path) -> Path:
-    """Weights with activation ranges, which all others have: measured on frames that were trained on where missing."""
+def calibrated(name: str, weights: Path, folder: Path, keep: Path) -> Path:
+    """Weights with activation ranges, which all others have: measured on frames that were trained on where missing.
+
+    They are kept under the candidate's name: files of different folders are often called the same.
+    """
     if load_weights(find_weights(str(weights))).card.activation_ranges:
         return weights
-    target = keep / f"{'-'.join(weights.with_suffix('').parts[-2:])}.safetensors"
+    target = keep / f"{name.replace(' ', '-')}.safetensors"
     if not target.is_file():
         write_calibrated(weights, target, calibration_images(read_split(folder / "split.json").training, 24))
     return target
@@ -171,17 +176,27 @@ def _gain(before: Shares, after: Shares, gaps: list[str], column: int) -> str:
 def correlations(found: dict[str, Shares], spoiled: set[str]) -> None:
     """Rank correlation of judge and truth, over all candidates and over those that are not spoiled."""
     some = next(iter(found.values()))
-    groups = {"all": list(found), "not spoiled": [name for name in found if name not in spoiled]}
-    for gap in [name.split()[1] for name in some if name.startswith("judge") and f"truth {name.split()[1]}" in some]:
+    gaps = [name.split()[1] for name in some if name.startswith("judge") and f"truth {name.split()[1]}" in some]
+    if not gaps or len(found) < _FEWEST:
+        return
+    print("\n| frames apart | candidates | number | rank correlation: share, 8 px | 3 px | number, 8 px | 3 px |")
+    groups = {"all": list(found)}
+    if spoiled:
+        groups["not spoiled"] = [name for name in found if name not in spoiled]
+    for words, chosen in [*((gap, [gap]) for gap in gaps), ("all gaps", gaps)]:
         for group, names in groups.items():
             ranks = []
-            for limit in (1, 0):
+            for column in (1, 0, 3, 2):
                 judge, truth = (
-                    [np.array(found[name][f"{kind} {gap}"])[:, limit].mean() for name in names]
-                    for kind in ("judge", "truth")
+                    [_mean(found[name], kind, chosen, column) for name in names] for kind in ("judge", "truth")
                 )
                 ranks.append(spearmanr(judge, truth).statistic)
-            print(f"| {gap} | {group} | {len(names)} | {ranks[0]:.3f} | {ranks[1]:.3f} |")
+            cells = " | ".join(f"{rank:.3f}" for rank in ranks)
+            print(f"| {words} | {group} | {len(names)} | {cells} |")
+
+
+def _mean(values: Shares, kind: str, gaps: list[str], column: int) -> float:
+    return float(np.mean([np.array(values[f"{kind} {gap}"])[:, column].mean() for gap in gaps]))
 
 
 def main() -> None:
@@ -210,18 +225,18 @@ def main() -> None:
                     file = keep / folder.name / f"{name.replace(' ', '-')}.scores.json"
                     if not file.is_file():
                         file.parent.mkdir(parents=True, exist_ok=True)
-                        file.write_text(json.dumps(shares(chosen, calibrated(path, folder, file.parent))))
+                        file.write_text(json.dumps(shares(chosen, calibrated(name, path, folder, file.parent))))
                     found[name] = json.loads(file.read_text())
                 print(f"\n{chosen.name}: pairs " + ", ".join(f"{name}: {len(p)}" for name, p in chosen.pairs.items()))
                 if arguments.only:
                     for column in (1, 0, 3, 2):
                         compared(found, column)
+                    correlations(found, set())
                     continue
                 print("| candidate | " + " | ".join(found[bundled[0]]) + " |")
                 for name, values in found.items():
                     means = " | ".join(f"{np.array(pairs)[:, 1].mean():.3f}" for pairs in values.values())
                     print(f"| {name} | {means} |")
-                print("\n| frames apart | candidates | number | rank correlation, 8 px | 3 px |")
                 correlations(found, {name for name in made if not name.startswith("mixed")})
 
 

@@ -399,7 +399,7 @@ def _own_targets() -> dict[str, Target]:
         return folder / "out" / ".improvo.json"
 
     def depth(folder: Path) -> Path:
-        with DepthWriter(folder / "depth.zip", np.eye(3), 4.0) as maps:
+        with DepthWriter(folder / "depth.zip", np.eye(3)) as maps:
             maps.write(0, np.ones((6, 8), np.float32))
         return folder / "depth.zip"
 

@@ -11,7 +11,7 @@ import numpy as np
 from improvo.config import to_dict
 from improvo.geometry.camera import Camera
 from improvo.labeling.frames import FRAMES_FILE, FramesTable, pack_images, write_frames
-from improvo.labeling.store import DONE, LabelStore, SequenceRecord
+from improvo.labeling.store import DONE, LabelStore, SequenceRecord, finish_sequence
 from improvo.sequences import write_trajectory
 from improvo.sequences.base import SequenceSettings
 from improvo.stability.rule import IGNORE, STABLE, UNSTABLE
@@ -94,9 +94,13 @@ def write_labeled_scene(
     (partial / "run.json").write_text(json.dumps({"camera": to_dict(CAMERA)}))
     pack_images(partial, [(draw(frame), None) for frame in range(FRAMES)])
     counts = {"stable": int((stability == STABLE).sum()), "unstable": int((stability == UNSTABLE).sum())}
-    store.finish(
-        SequenceRecord(name, "/nowhere", DONE, frames=FRAMES, tracked=FRAMES, tracks=len(tracks), packed=True, **counts)
+    finish_sequence(
+        store.folder,
+        SequenceRecord(
+            name, "/nowhere", DONE, frames=FRAMES, tracked=FRAMES, tracks=len(tracks), packed=True, **counts
+        ),
     )
+    store.refresh_manifest()
     return folder
 
 

@@ -159,3 +159,29 @@ def test_a_second_opencv_is_told(
     assert main(["info", str(write_walk(tmp_path / "walk", frames=2))]) == 0
     told = "opencv-python 5.0 and opencv-contrib-python-headless 5.0 are both installed" in capsys.readouterr().err
     assert told == bool(also)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits the size of files, as a full disk would")
+@pytest.mark.parametrize("suffix", [".mp4", ".webm", ".gif"])
+def test_a_video_that_does_not_fit_on_the_disk(tmp_path: Path, suffix: str) -> None:
+    """OpenCV does not say when it cannot write a frame."""
+    program = f"""
+import resource, sys
+import numpy as np
+from pathlib import Path
+from improvo.errors import OutputError
+from improvo.report.sheets import write_video
+noise = np.random.default_rng(0)
+pictures = [noise.integers(0, 255, (120, 160, 3), dtype=np.uint8) for _ in range(40)]
+folder = Path({str(tmp_path)!r})
+write_video(folder / "whole{suffix}", pictures, 30.0)
+resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
+try:
+    write_video(folder / "part{suffix}", pictures, 30.0)
+except OutputError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=True)
+    assert "cannot be written" in done.stdout
+    assert len(done.stdout.splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == [f"whole{suffix}"]

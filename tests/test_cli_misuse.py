@@ -7,15 +7,21 @@ import shlex
 import subprocess
 import sys
 import wave
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from rendered_walk import write_walk
 
+from improvo import config
+from improvo.cli.commands import settings_class
+from improvo.cli.config import SETTINGS
 from improvo.cli.main import main
 from improvo.cli.output import configured, next_step, notice, say, typed
+from improvo.errors import ConfigError
 from improvo.sequences import open_sequence
 from improvo.terminal import one_line, printable
 
@@ -30,6 +36,14 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def video(walk: Path) -> Path:
     return write_video(walk.with_name("walk.mp4"), [cv2.imread(str(path)) for path in sorted(walk.glob("*.png"))])
+
+
+@pytest.fixture(scope="module")
+def finished(walk: Path) -> Path:
+    """A run of the walk."""
+    out = walk.with_name("finished")
+    assert main(["run", str(walk), "-o", str(out), *ORB, "--quiet"]) == 0
+    return out
 
 
 def write_video(path: Path, pictures: list[np.ndarray]) -> Path:
@@ -198,17 +212,23 @@ def test_an_output_that_is_the_input(
         ("calibrate", "--print-board", "{other}"),
         ("truth", "{video}", "-o", "{other}", "--fov", "60"),
         ("info", "{video}", "--write-mask", "{other}"),
+        ("export", "onnx", "superpoint-small", "-o", "{other}"),
+        ("export", "trajectory", "{run}", "-o", "{other}"),
+        ("report", "{run}", "-o", "{other}"),
+        ("show", "map", "{run}", "-o", "{other}"),
+        ("show", "tracks", "{run}", "-o", "{other}"),
     ],
-    ids=lambda words: words[0] + words[1][:4],
+    ids=lambda words: "-".join(words[:2]).replace("{", "").replace("}", ""),
 )
 def test_a_file_of_another_kind_is_not_replaced(
-    video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
+    video: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
 ) -> None:
-    if words[0] == "truth":
-        pytest.importorskip("pycolmap")
+    for command, package in (("truth", "pycolmap"), ("onnx", "onnx"), ("map", "matplotlib")):
+        if command in words:
+            pytest.importorskip(package)
     other = tmp_path / "holiday.mov"
     other.write_text("precious")
-    told = refused(tuple(word.format(video=video, other=other) for word in words), capsys)
+    told = refused(tuple(word.format(video=video, other=other, run=finished) for word in words), capsys)
     assert told.startswith(f"improvo: {other}: exists, and is no .")
     assert other.read_text() == "precious"
 
@@ -312,3 +332,61 @@ def test_a_trajectory_without_rotations_is_told(tmp_path: Path, capsys: pytest.C
     assert "neither a pose (quaternion qx qy qz qw of length 1)" in refused(
         ("evaluate", "trajectory", path, path), capsys
     )
+
+
+# --- numbers
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("--seed", "-1"), "seed=-1: must be 0 or more, and less than 4294967296"),
+        (("--seed", "99999999999999999999"), "must be 0 or more, and less than 4294967296"),
+        (("--set", "odometry.tolerance=.inf"), "`odometry.tolerance`: inf is no finite number"),
+        (("--set", "odometry.matching.max_distance=.nan"), "`odometry.matching.max_distance`: nan is no finite number"),
+        (("--fps", "inf"), "`sequence.fps`: inf is no finite number"),
+        (("--fps", "1e-300"), "fps 1e-300 is no number of frames a second"),
+    ],
+)
+def test_numbers_that_mean_nothing(
+    walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], says: str
+) -> None:
+    assert says in refused(("run", walk, "-o", tmp_path / "out", *ORB, *words, "--quiet"), capsys)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", sorted(SETTINGS))
+def test_a_seed_that_no_generator_takes_and_a_number_without_end_are_refused_everywhere(command: str) -> None:
+    cls = settings_class(SETTINGS[command])
+    plain = config.to_dict(cls())
+
+    def names(values: dict[str, Any], kind: type, only: str = "", prefix: str = "") -> Iterator[str]:
+        for name, value in values.items():
+            if isinstance(value, dict):
+                yield from names(value, kind, only, f"{prefix}{name}.")
+            elif type(value) is kind and only in ("", name):
+                yield f"{prefix}{name}"
+
+    for name in names(plain, int, "seed"):
+        with pytest.raises(ConfigError, match="must be 0 or more"):
+            config.load(cls, None, [f"{name}=-1"])
+    for name in names(plain, float):
+        with pytest.raises(ConfigError):
+            config.load(cls, None, [f"{name}=.inf"])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux takes any bytes as a name")
+def test_a_recording_whose_name_is_no_text(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Runs and pages show it with a sign in its place; tables of labels cannot hold it."""
+    room = Path(os.fsdecode(os.fsencode(tmp_path) + b"/room\xff"))
+    room.symlink_to(walk)
+    out = tmp_path / "out"
+    assert main(["run", str(room), "-o", str(out), *ORB, "--quiet"]) == 0
+    assert main(["report", str(out)]) == 0
+    assert "room\ufffd" in (out / "report.html").read_text(encoding="utf-8", errors="replace")
+    other = Path(os.fsdecode(os.fsencode(tmp_path) + b"/hall\xff"))
+    other.mkdir()
+    for path in walk.iterdir():
+        (other / path.name).symlink_to(path)
+    capsys.readouterr()
+    assert "its name is no text" in refused(("label", other, "-o", tmp_path / "labels", *ORB, "--quiet"), capsys)

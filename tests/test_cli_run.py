@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -114,17 +116,37 @@ def test_one_unreadable_frame_is_skipped_and_named(walk: Path, tmp_path: Path) -
     assert report["frames"]["tracked"] == 23
 
 
+def there_and_back(walk: Path, folder: Path) -> Path:
+    """The walk again and again, 960 frames."""
+    folder.mkdir()
+    pictures = sorted(walk.glob("*.png"))
+    for i, path in enumerate([*pictures, *reversed(pictures)] * 20):
+        (folder / f"{i:06d}.png").symlink_to(path)
+    (folder / "camera.yaml").write_bytes((walk / "camera.yaml").read_bytes())
+    return folder
+
+
+def wait_for_some_frames(out: Path, is_running: Callable[[], bool]) -> None:
+    """Until a run is at work."""
+    deadline = time.monotonic() + 240
+    while not list(out.glob(".tracks*")) and time.monotonic() < deadline and is_running():
+        time.sleep(0.05)
+    time.sleep(2)
+
+
+def check_partial_result(out: Path) -> None:
+    """What an interrupted run leaves is valid."""
+    report = json.loads((out / "run.json").read_text())
+    assert report["interrupted"] is True
+    assert 2 <= report["frames"]["processed"] < 960
+    assert len(read_points(out / "points.parquet")) > 0
+    assert not list(out.glob("*.partial*"))
+
+
 @pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_leaves_a_valid_partial_result(walk: Path, tmp_path: Path, number: int) -> None:
-    long = tmp_path / "long"
-    long.mkdir()
-    pictures = sorted(walk.glob("*.png"))
-    there_and_back = [*pictures, *reversed(pictures)] * 20
-    for i, path in enumerate(there_and_back):
-        (long / f"{i:06d}.png").symlink_to(path)
-    (long / "camera.yaml").write_bytes((walk / "camera.yaml").read_bytes())
-    out = tmp_path / "out"
+    long, out = there_and_back(walk, tmp_path / "long"), tmp_path / "out"
     code = "import sys, improvo.cli.main as m, improvo.terminal as t; t.INTERVAL = 0; sys.exit(m.main())"
     command = [sys.executable, "-c", code, "run", str(long), "-o", str(out), "--frontend", "orb"]
     # a shell's background job hands SIGINT down as ignored, and Python then leaves it so
@@ -132,17 +154,33 @@ def test_an_interrupt_leaves_a_valid_partial_result(walk: Path, tmp_path: Path, 
     with subprocess.Popen(
         command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, preexec_fn=heed_interrupts
     ) as process:
-        deadline = time.monotonic() + 240
-        while not list(out.glob(".tracks*")) and time.monotonic() < deadline and process.poll() is None:
-            time.sleep(0.05)
-        time.sleep(2)  # some frames
+        wait_for_some_frames(out, lambda: process.poll() is None)
         process.send_signal(number)
         assert process.wait(timeout=120) == 130
-    report = json.loads((out / "run.json").read_text())
-    assert report["interrupted"] is True
-    assert 2 <= report["frames"]["processed"] < len(there_and_back)
-    assert len(read_points(out / "points.parquet")) > 0
-    assert not list(out.glob("*.partial*"))
+    check_partial_result(out)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a terminal that can be closed")
+def test_a_terminal_that_is_closed_leaves_a_valid_partial_result(walk: Path, tmp_path: Path) -> None:
+    """As when the connection to another machine breaks; the progress bar has nowhere to go then."""
+    import pty
+
+    long, out = there_and_back(walk, tmp_path / "long"), tmp_path / "out"
+    child, terminal = pty.fork()
+    if child == 0:
+        words = ["-m", "improvo", "run", str(long), "-o", str(out), "--frontend", "orb"]
+        os.execv(sys.executable, [sys.executable, *words])
+    os.set_blocking(terminal, False)
+
+    def is_running() -> bool:
+        with suppress(BlockingIOError):
+            os.read(terminal, 1 << 16)  # or the command waits until somebody does
+        return os.waitpid(child, os.WNOHANG) == (0, 0)
+
+    wait_for_some_frames(out, is_running)
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 130
+    check_partial_result(out)
 
 
 class TestBadInput:

@@ -30,6 +30,17 @@ def test_the_same_settings_go_on(record: SettingsRecord) -> None:
     assert record.read() == SETTINGS
 
 
+def test_a_file_counts_by_what_is_in_it_but_in_records_that_do_not_say(tmp_path: Path) -> None:
+    record = SettingsRecord(tmp_path / "settings.yaml", contents={"sequence.camera": "camera_content"})
+    record.write({"sequence": {"camera": "a.yaml"}, "camera_content": "sha256:1"})
+    assert record.difference({"sequence": {"camera": "b.yaml"}, "camera_content": "sha256:1"}) == ""
+    changed = {"sequence": {"camera": "a.yaml"}, "camera_content": "sha256:2"}
+    assert record.difference(changed) == "camera_content=sha256:1, now sha256:2"
+    record.write({"sequence": {"camera": "a.yaml"}})  # of an earlier version
+    assert record.difference(changed) == ""
+    assert record.difference({**changed, "sequence": {"camera": "b.yaml"}}) == "sequence.camera=a.yaml, now b.yaml"
+
+
 def test_another_setting_is_refused_and_named_with_the_mend(record: SettingsRecord) -> None:
     other = {**SETTINGS, "frontend": {"name": "orb", "max_keypoints": 600}}
     with pytest.raises(ConfigError, match=r"out: was begun with frontend\.max_keypoints=500, now 600; try again$"):

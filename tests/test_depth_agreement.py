@@ -45,6 +45,13 @@ def test_true_maps_agree() -> None:
     assert ((found.agreeing >= 2) == (found.depth > 0)).all()
 
 
+def test_a_map_that_needs_no_other_stays_as_it_is_where_there_is_none() -> None:
+    found = agreed(exact(MIDDLE), [], AgreementSettings(least=0))
+    np.testing.assert_array_equal(found.depth, exact(MIDDLE).depth)
+    np.testing.assert_array_equal(found.confidence, exact(MIDDLE).confidence)
+    assert agreed(exact(MIDDLE), [], AgreementSettings(least=1)).known == 0
+
+
 def test_what_only_one_frame_says_is_dropped() -> None:
     true = exact(MIDDLE)
     depth = true.depth.copy()

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from rendered_walk import write_walk
 
@@ -16,6 +20,7 @@ from improvo.depth.dense import refuse_live, write_dense
 from improvo.depth.settings import DepthSettings
 from improvo.errors import InputError
 from improvo.geometry import se3
+from improvo.odometry.run import metres_per_unit
 from improvo.odometry.run_folder import RunFolder
 from improvo.sequences import Sequence, open_sequence
 
@@ -100,6 +105,40 @@ def copied(run: Path, to: Path) -> Path:
     for path in run.iterdir():
         (to / path.name).write_bytes(path.read_bytes())
     return to
+
+
+@pytest.mark.parametrize("factor", [0.2, 22.0])
+def test_a_run_in_metres_has_the_same_depth_and_cloud_in_metres(
+    factor: float, walk: Path, dense: Path, tmp_path: Path
+) -> None:
+    """As after --scale: poses and points are `factor` times as long."""
+    summary = Summary(copied(dense, tmp_path / "out"))
+    poses = np.array(summary.trajectory.world_from_cam)
+    poses[:, :3, 3] *= factor
+    summary.trajectory = replace(summary.trajectory, world_from_cam=poses)
+    table = pq.read_table(dense / "points.parquet")
+    for axis in "xyz":
+        column = table.schema.get_field_index(axis)
+        table = table.set_column(column, axis, pa.array(factor * table[axis].to_numpy()))
+    pq.write_table(table, summary.folder / "points.parquet")
+    summary.unit = "metres, from a known distance"
+    summary.report["metric"] = {"segments": [{"segment": 0, "metres_per_unit": factor}]}
+    entry = write_dense(open_sequence(walk), summary, DepthSettings())  # type: ignore[arg-type]
+    before = json.loads((dense / "run.json").read_text())["depth"]
+    assert entry["points"] == pytest.approx(before["points"], rel=0.05)
+    assert entry["share"] == pytest.approx(before["share"], abs=0.01)
+    ours, theirs = DepthReader(summary.folder).depth(9), DepthReader(dense).depth(9)
+    both = (ours > 0) & (theirs > 0)
+    assert np.median(ours[both] / theirs[both]) == pytest.approx(factor, rel=1e-3)
+    with zipfile.ZipFile(summary.folder / "depth.zip") as file:
+        assert json.loads(file.read("depth.json"))["unit"] == summary.unit
+
+
+def test_the_unit_of_each_segment_is_that_of_the_one_before_where_it_is_not_known() -> None:
+    known = [{"segment": 1, "metres_per_unit": 2.0}, {"segment": 3, "metres_per_unit": 5.0}]
+    report = {"metric": {"segments": known}}
+    assert [metres_per_unit(report, segment) for segment in range(5)] == [2.0, 2.0, 2.0, 5.0, 5.0]
+    assert metres_per_unit({}, 0) == 1.0
 
 
 def test_an_interrupt_leaves_a_valid_part(walk: Path, dense: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from depth_scene import CAMERA, Plane, halved, plain, render, sideways, textured
 from improvo.depth import DepthMap
 from improvo.depth.frame_depth import sweep_depth
 from improvo.depth.neighbours import choose_neighbours
-from improvo.depth.settings import NeighbourSettings
+from improvo.depth.settings import DepthSettings, NeighbourSettings
 from improvo.errors import ConfigError
 from improvo.types import Float64
 
@@ -42,6 +42,16 @@ def test_a_wall_is_where_it_is(depth_range: tuple[float, float, float] | None) -
     assert (errors(found, truth) > 0.03).mean() < 0.005
     assert ((found.confidence > 0) == (found.depth > 0)).all()
     assert found.confidence.max() <= 1
+
+
+@pytest.mark.parametrize("frames", [2, 3, 5])
+def test_one_or_two_neighbours_are_enough(frames: int) -> None:
+    pictures = [render([wall(2.0, textured(0))], pose) for pose in sideways(frames, 0.1)]
+    images = [image for image, _ in pictures]
+    settings = DepthSettings(neighbours=NeighbourSettings(least=1, most=2))
+    found = sweep_depth(images, sideways(frames, 0.1), CAMERA.K, frames // 2, range(frames), RANGE, settings)
+    assert found.known > 0.7
+    assert np.median(errors(found, halved(pictures[frames // 2][1]))) < 0.01
 
 
 def test_a_slanted_floor_and_a_near_wall_before_it() -> None:

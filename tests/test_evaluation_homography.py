@@ -10,10 +10,16 @@ import numpy as np
 import pytest
 
 from improvo.cli.main import main
-from improvo.errors import InputError
+from improvo.errors import ConfigError, InputError
 from improvo.evaluation.homography.pairs import hpatches_scenes, open_scene, picture_scenes
-from improvo.evaluation.homography.protocol import evaluate_pair, matching_precision
+from improvo.evaluation.homography.protocol import (
+    evaluate_pair,
+    homography_table,
+    matching_precision,
+    run_homography_protocol,
+)
 from improvo.evaluation.settings import HomographySettings
+from improvo.evaluation.sources import LoadedFrontend
 from improvo.training.views import inside, warp_points
 from improvo.types import Features, Float64
 
@@ -133,6 +139,55 @@ def test_one_command_on_both_inputs(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "all: 3 pairs" in first
     assert main([*words, "--synthesize", str(pictures), "--views", "3"]) == 0
     assert capsys.readouterr().out == first
+
+
+@pytest.mark.parametrize("shape", [(235, 313), (240, 320), (239, 97), (16, 23)])
+def test_pictures_of_any_size_are_warped_exactly(shape: tuple[int, int], tmp_path: Path) -> None:
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    picture = np.rint(60 + x * 130 / shape[1] + y * 60 / shape[0]).astype(np.uint8)  # a plane, whose views are known
+    cv2.imwrite(str(tmp_path / "a.png"), picture)
+    (scene,) = picture_scenes(tmp_path)
+    reference, views = open_scene(scene, HomographySettings(views=4))
+    np.testing.assert_array_equal(reference, picture)
+    for view in views:
+        height, width = view.image.shape
+        assert (height, width) == (shape[0] // 8 * 8, shape[1] // 8 * 8)
+        pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
+        shown = warp_points(np.linalg.inv(view.view_from_reference), pixels)
+        within = inside(shown, shape[1], shape[0])
+        assert within.mean() > 0.4
+        expected = 60 + shown[..., 0] * 130 / shape[1] + shown[..., 1] * 60 / shape[0]
+        assert np.abs(expected - view.image)[within].max() < 1.6
+
+
+def test_a_picture_of_any_size_is_evaluated_and_a_tiny_one_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), checkered(1, (235, 313)))
+    words = ["evaluate", "homography", "--frontend", "orb", "--workers", "1", "--synthesize", str(tmp_path)]
+    assert main([*words, "--views", "2"]) == 0
+    assert "all: 2 pairs" in capsys.readouterr().out
+    cv2.imwrite(str(tmp_path / "b.png"), checkered(1, (15, 40)))
+    assert main([*words, "--views", "2"]) == 2
+    assert "b.png: is 40x15 pixels; give pictures of 16x16 or more" in capsys.readouterr().err
+
+
+def test_two_frontends_of_one_label_are_refused_and_what_cannot_run_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), checkered(1, (240, 320)))
+    scenes = picture_scenes(tmp_path)
+    files = [LoadedFrontend(f"{folder}/weights.safetensors") for folder in "ab"]
+    with pytest.raises(ConfigError, match="frontends: `weights` is given twice; name one by LABEL=NAME"):
+        run_homography_protocol(scenes, files, SETTINGS)
+    words = ["evaluate", "homography", "--synthesize", str(tmp_path), "--views", "2", "--workers", "1"]
+    assert main([*words, "--frontend", "orb", "--frontend", "again=orb"]) == 0
+    rows = [line.split("|")[1:] for line in capsys.readouterr().out.splitlines() if "orb" in line or "again" in line]
+    assert [row[0].strip() for row in rows] == ["orb", "again"]
+    assert rows[0][1:] == rows[1][1:]
+    found = run_homography_protocol(scenes, [LoadedFrontend("orb")], HomographySettings(views=1))
+    text = homography_table({**found, "skipped_frontends": [{"frontend": "surf", "reason": "not installed"}]})
+    assert text.endswith("\n\n- frontend surf not run: not installed\n")
 
 
 def test_bad_folders_are_one_line_errors(tmp_path: Path) -> None:

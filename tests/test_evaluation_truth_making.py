@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +22,7 @@ from improvo.evaluation.truth.motion_check import check_motion
 from improvo.evaluation.truth.reference import read_reference
 from improvo.evaluation.truth.settings import TruthSettings
 from improvo.evaluation.truth.structure_from_motion import ReconstructedImage, image_pairs
+from improvo.files import make_output_folder
 from improvo.geometry.alignment import align_points
 from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import inverse, rigid, rotation_angle_deg, so3_exp, transform
@@ -62,6 +65,22 @@ def made(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("made") / "truth.txt"
     assert main(["truth", str(walk), "-o", str(output), "--workers", "1", "--max-features", "700"]) == 0
     return output
+
+
+def test_two_on_one_output_do_not_meet(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pycolmap")
+    make_output_folder(tmp_path / "truth.work", "truth")
+    holder = "import sys, time; from improvo.folder_lock import locked; from pathlib import Path\n"
+    holder += "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
+    words = [sys.executable, "-c", holder, str(tmp_path / "truth.work")]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        try:
+            assert main(["truth", str(walk), "-o", str(tmp_path / "truth.txt")]) == 2
+        finally:
+            process.kill()
+    assert f"truth.work: process {process.pid} " in capsys.readouterr().err
 
 
 def test_what_does_not_fit_on_the_disk_is_refused_before_any_work(

@@ -11,14 +11,16 @@ import pytest
 
 from evaluation_scene import CAMERA, PlaneFeatures, PlaneSequence
 from improvo.cli.main import main
-from improvo.errors import InputError
+from improvo.errors import ConfigError, InputError, MissingExtraError
 from improvo.evaluation.settings import TrajectorySettings
+from improvo.evaluation.sources import LoadedFrontend
 from improvo.evaluation.trajectory.tables import vo_tables
 from improvo.evaluation.vo.protocol import WITH, WITHOUT, evaluate_vo, usable
 from improvo.frontend import Frontend
 from improvo.geometry.se3 import rigid, so3_exp
 from improvo.geometry.trajectory_files import write_trajectory
 from improvo.odometry.settings import OdometrySettings
+from improvo.simulation import bundled_sequence
 from improvo.types import Features, Frame, Trajectory, UInt8
 
 
@@ -140,7 +142,7 @@ def test_table_2_compares_both_variants_on_the_same_features(monkeypatch: pytest
     monkeypatch.setattr("improvo.evaluation.vo.protocol.load_frontend", knowing)
     settings = TrajectorySettings(time_windows=(0.5,))
     sources: Any = [IterableSource()]
-    outcomes, found = evaluate_vo(sources, ["knowing"], 500, OdometrySettings(mode="paper"), settings)
+    outcomes, found = evaluate_vo(sources, [LoadedFrontend("knowing", 500)], OdometrySettings(mode="paper"), settings)
     assert [o.variant for o in outcomes] == [WITHOUT, WITH]
     assert [row["variant"] for row in found["rows"]] == [WITHOUT, WITH]
     errors = [row["relative"][0]["translation_m"]["mean"] for row in found["rows"]]
@@ -149,6 +151,62 @@ def test_table_2_compares_both_variants_on_the_same_features(monkeypatch: pytest
     assert f"knowing {WITH}" in text
     assert "| No prediction" in text
     assert CAMERA.width == 160
+
+
+def test_two_weights_files_of_one_name_need_labels(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def knowing(name: str, max_keypoints: int) -> Frontend:
+        asked.append((name, max_keypoints))
+        return StabilityFrontend(IterablePlane(frames=40))
+
+    monkeypatch.setattr("improvo.evaluation.vo.protocol.load_frontend", knowing)
+    sources: Any = [IterableSource()]
+    files = ["first/weights.safetensors", "second/weights.safetensors"]
+    rest = OdometrySettings(mode="paper"), TrajectorySettings(time_windows=(0.5,))
+    with pytest.raises(ConfigError, match="frontends: `weights` is given twice; name one by LABEL=NAME"):
+        evaluate_vo(sources, [LoadedFrontend(file) for file in files], *rest)
+    for labels, folder in ((["a b", "a_b"], "a_b"), (["a/b", "a_b"], "a_b")):
+        with pytest.raises(ConfigError, match=f"`{labels[0]}` and `{labels[1]}` would share the folder `{folder}`"):
+            evaluate_vo(sources, [LoadedFrontend(f, 300, label) for f, label in zip(files, labels, strict=True)], *rest)
+    with pytest.raises(ConfigError, match="sequences: `plane` is given twice; rename one"):
+        evaluate_vo(sources * 2, [LoadedFrontend(files[0])], *rest)
+    assert not asked
+    named = [LoadedFrontend(file, 300, label) for file, label in zip(files, ("before", "after"), strict=True)]
+    outcomes, found = evaluate_vo(sources, named, *rest)
+    assert asked == [(files[0], 300), (files[1], 300)]
+    rows = [(row["frontend"], row["variant"], row["sequences"]) for row in found["rows"]]
+    assert rows == [("before", WITHOUT, 1), ("before", WITH, 1), ("after", WITHOUT, 1), ("after", WITH, 1)]
+    assert [outcome.frontend for outcome in outcomes] == ["before", "before", "after", "after"]
+
+
+def test_the_command_says_what_it_takes_and_what_it_left_out(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["evaluate", "vo", "--help"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert "LABEL=NAME names its row; repeatable (default: superpoint-vo)" in told
+    assert "xfeat" not in told
+    demo = str(bundled_sequence())
+    assert main(["evaluate", "vo", demo, "--frontend", "mine=xfeat"]) == 2
+    assert "--frontend xfeat: odometry has only our own frontends" in capsys.readouterr().err
+
+    def check(self: LoadedFrontend) -> None:
+        if self.name not in ("orb", "sift"):
+            raise MissingExtraError(f"frontend {self.name}", "surf")
+
+    monkeypatch.setattr(LoadedFrontend, "check", check)
+    words = ["evaluate", "vo", demo, "--frontend", "all", "--frontend", "my orb=orb", "--max-frames", "20"]
+    assert main([*words, "--stride", "1", "--windows", "0.3", "--workers", "1", "-o", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    assert "- frontend surf not run: " in printed
+    assert "xfeat" not in printed
+    found = json.loads((tmp_path / "out" / "vo.json").read_text())
+    assert [row["frontend"] for row in found["rows"]] == ["my orb", "sift", "orb"]
+    assert {entry["frontend"] for entry in found["skipped_frontends"]} >= {"surf", "superpoint-vo"}
+    for folder in ("my_orb", "sift", "orb"):
+        assert (tmp_path / "out" / folder / "demo.txt").stat().st_size > 500
 
 
 def test_sequences_with_invalid_truth_are_left_out_and_named() -> None:

@@ -115,3 +115,37 @@ def test_a_marker_that_somebody_changed(tmp_path: Path, content: str) -> None:
     (tmp_path / "out" / ".improvo.json").write_bytes(content.encode("utf-8", "surrogatepass"))
     with pytest.raises(OutputError, match="has files that improvo did not write"):
         check_output_folder(tmp_path / "out", "run")
+
+
+def test_the_next_output_file_clears_what_a_killed_command_left_beside_it(tmp_path: Path) -> None:
+    """In a folder of the user's, so nothing else there is touched, nor anything below."""
+    dead = dead_process()
+    left = [tmp_path / f".camera.yaml.{dead}-ab12.partial.yaml", tmp_path / f".camera.json.{dead}-ab12.partial.json"]
+    kept = [
+        tmp_path / f".camera.yaml.{os.getppid()}-ab12.partial.yaml",  # its process still runs
+        tmp_path / ".download.partial",
+        tmp_path / ".hidden",
+        tmp_path / "below" / f".camera.yaml.{dead}-ab12.partial.yaml",
+    ]
+    (tmp_path / "below").mkdir()
+    for path in [*left, *kept]:
+        path.write_text("")
+    files.check_output_file(tmp_path / "camera.yaml", (".yaml",))
+    assert [path for path in [*left, *kept] if path.exists()] == kept
+
+
+def test_a_file_that_is_read_is_replaced_only_when_it_is_no_longer(tmp_path: Path) -> None:
+    class Reader:
+        pass
+
+    path, reader = tmp_path / "walk.mp4", Reader()
+    path.write_text("only copy")
+    files.never_replace(path, reader)
+    os.symlink(path, tmp_path / "link.mp4")
+    for target in (path, tmp_path / "link.mp4"):
+        with pytest.raises(OutputError, match="is being read, and the output would replace it"):
+            files.write_text(target, "")
+    files.write_text(tmp_path / "other.mp4", "")
+    del reader
+    files.write_text(path, "new")
+    assert path.read_text() == "new"

@@ -69,15 +69,14 @@ def test_training_keeps_dead_channels_out_and_saves_the_published_widths(tmp_pat
     full = Architecture("full", encoder=(8, 8, 8, 8, 8, 8, 8, 8), head=8, descriptor=8)
     monkeypatch.setitem(ARCHITECTURES, "full", full)
     asked = HomographiesSettings(architecture="full", stem_channels=4)
-    network, _ = first_network(asked.architecture, 0, None, asked.stem_channels)
+    network = first_network(asked.architecture, 0, None, asked.stem_channels)
     assert network.architecture.encoder == (4, 4, 4, 4, 8, 8, 8, 8)
     tensors = {name: values.numpy() for name, values in network.state_dict().items()}
     published = dataclasses.replace(full, stability=False)
     path = tmp_path / "full.safetensors"
     save_weights(path, with_dead_channels(tensors, published), ModelCard(published, "none"))
     assert load_weights(path).architecture.encoder == full.encoder
-    again, parent = first_network("full", 0, path)
-    assert parent == path.name
+    again = first_network("full", 0, path)
     assert again.architecture.encoder == network.architecture.encoder
     for name, values in network.state_dict().items():
         torch.testing.assert_close(again.state_dict()[name], values)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from camera_notations import (
     REFUSED,
     SIZE,
     ZED,
+    K,
 )
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
@@ -112,6 +114,66 @@ def test_colmap_cameras_as_pycolmap_writes_and_projects_them(tmp_path: Path, suf
     (tmp_path / "sparse" / "0").mkdir(parents=True)
     (tmp_path / "sparse" / "0" / f"cameras.{suffix}").write_bytes((tmp_path / f"cameras.{suffix}").read_bytes())
     assert load_calibration(str(tmp_path)).size == SIZE
+
+
+@pytest.mark.parametrize("suffix", ["txt", "bin"])
+@pytest.mark.parametrize("second", ["unsupported", "unknown", "impossible"])
+def test_a_camera_that_is_not_asked_for_need_not_be_supported(tmp_path: Path, suffix: str, second: str) -> None:
+    """The first is taken where none is named; to ask for the other says what is wrong with it."""
+    model, number, values = {
+        "unsupported": ("THIN_PRISM_FISHEYE", 10, [1.0] * 12),
+        "unknown": ("OF_TOMORROW", 99, [1.0] * 3),
+        "impossible": ("PINHOLE", 1, [-400.0, 401, 376, 240]),
+    }[second]
+    first = [400.0, 401, 376, 240]
+    path = tmp_path / f"cameras.{suffix}"
+    if suffix == "txt":
+        path.write_text(
+            f"1 PINHOLE 752 480 {' '.join(map(str, first))}\n7 {model} 752 480 {' '.join(map(str, values))}\n"
+        )
+    else:
+        rows = [
+            struct.pack(f"<iiQQ{len(p)}d", camera, n, *SIZE, *p)
+            for camera, n, p in ((1, 1, first), (7, number, values))
+        ]
+        path.write_bytes(struct.pack("<Q", 2) + b"".join(rows))
+    for camera in ("", "#1"):
+        assert load_calibration(f"{path}{camera}").intrinsics == (400, 401, 375.5, 239.5)
+    with pytest.raises(InputError, match=r"not supported|fx"):
+        load_calibration(f"{path}#7")
+
+
+PAIR = """%YAML:1.0
+---
+M1: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 400., 0., 376., 0., 401., 240., 0., 0., 1. ]
+D1: !!opencv-matrix
+   rows: 1
+   cols: 4
+   dt: d
+   data: [ -0.28, 0.07, 0., 0. ]
+P1: !!opencv-matrix
+   rows: 3
+   cols: 4
+   dt: d
+   data: [ 380., 0., 370., 0., 0., 380., 240., 0., 0., 0., 1., 0. ]
+P2: [380., 0., 370., -9., 0., 380., 240., 0., 0., 0., 1., 0.]
+Tr: 0
+"""
+
+
+def test_rows_of_a_stereo_pair_in_yaml_are_not_those_of_kitti(tmp_path: Path) -> None:
+    flat = FX_TO_CY.format("") + "k1: -0.28\nk2: 0.07\np1: 0\np2: 0\nP1: [380, 0, 370, 0, 0, 380, 240, 0, 0, 0, 1, 0]\n"
+    for name, content in (("a.yml", PAIR), ("b.yml", K + "dist_coeffs: [-0.28, 0.07, 0, 0]\nTr: 0\n"), ("c.yml", flat)):
+        calibration = load_calibration(written(tmp_path, name, content))
+        assert calibration.distortion[:4] == (-0.28, 0.07, 0, 0)
+    kitti = "P0: 400 0 376 0 0 401 240 0 0 0 1 0\nP1: 4e2 0 376 -2.1e+02 0 401 240 0 0 0 1 0\n"
+    for content in (kitti, kitti.replace("\n", "\r\n"), kitti.replace(": ", ":\t")):
+        assert load_calibration(written(tmp_path, "calib.txt", content)).intrinsics == (400, 401, 376, 240)
+        assert load_calibration(written(tmp_path, "calib.txt#P1", content)).intrinsics == (400, 401, 376, 240)
 
 
 def test_the_camera_of_the_images_size_is_taken(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -70,6 +71,29 @@ def test_a_room_imports_only_from_lower_floors() -> None:
             if other != room and not below:
                 upward.append(f"{file.relative_to(PACKAGE)}:{line}: {room} imports {other}")
     assert not upward, "\n".join(upward)
+
+
+ROOMS = {folder.name for folder in PACKAGE.iterdir() if (folder / "__init__.py").is_file()}
+
+
+def said_imports(docstring: str) -> set[str] | None:
+    """Rooms that the docstring of a room says that it imports; None where it says nothing."""
+    sentence = re.search(r"\bIt imports (.*?)\.(?=\s|$)", docstring, re.DOTALL)
+    if sentence is None:
+        return None
+    named = set(re.findall(r"`(\w+)`", sentence[1]))
+    return ROOMS - named if sentence[1].startswith("every room but") else named
+
+
+def test_a_room_says_which_other_rooms_it_imports() -> None:
+    wrong = []
+    for room in sorted(ROOMS):
+        tree = ast.parse((PACKAGE / room / "__init__.py").read_text())
+        said = said_imports(ast.get_docstring(tree) or "")
+        true = {other for file in (PACKAGE / room).rglob("*.py") for _, other in imports(file)} & ROOMS
+        if said is None or said - {room} != true - {room}:
+            wrong.append(f"{room}: says {sorted(said or ())}, imports {sorted(true - {room})}")
+    assert not wrong, "\n".join(wrong)
 
 
 def test_the_lowest_floor_has_no_circle() -> None:

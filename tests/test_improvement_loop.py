@@ -25,7 +25,7 @@ from improvo.frontend.weights import load_weights
 from improvo.improvement.improve import Improvement
 from improvo.improvement.progress import ImprovementProgress
 from improvo.improvement.settings import ImproveSettings, ValidationSettings
-from improvo.improvement.validation import GapScores, Validation, gain, is_better, read_validation, rule
+from improvo.improvement.validation import GapScores, Validation, gain, is_better, read_validation, rule, summary
 from improvo.labeling.labeled import read_labels
 
 EXAMPLE = Path(__file__).with_name("improvement_example.py")
@@ -366,6 +366,27 @@ def test_better_is_more_right_matches_with_odometry_that_is_no_worse() -> None:
     assert not is_better(validation(more, segments=2), nothing, settings)
 
 
+def test_the_card_has_every_level_where_recordings_share_a_gap() -> None:
+    def scores(recording: str, level: int, gap: int, right: float) -> GapScores:
+        return GapScores(recording, level, gap, gap / 30, [[0, gap]] * 2, [50, 50], {"right_3px": [right / 2] * 2,
+                         "right_8px": [right] * 2})  # fmt: skip
+
+    def measured(better: float) -> Validation:
+        slow, fast = (
+            [scores("slow", 0, 10, 0.8 + better)],
+            [("fast", 0, 5, 0.6 + better), ("fast", 1, 10, 0.3 + better)],
+        )
+        return Validation(100, 100, 1, 8.0, 0.8, 0.5, {}, (*slow, *(scores(*each) for each in fast)))
+
+    assert summary(measured(0.1), measured(0.0), ValidationSettings()) == {
+        "level_0": "5 to 10 frames (0.167 to 0.333 s)", "level_1": "10 frames (0.333 s)",
+        "right_3px_level_0": 0.4, "right_3px_level_0_at_the_start": 0.35,
+        "right_3px_level_1": 0.2, "right_3px_level_1_at_the_start": 0.15,
+        "right_8px_level_0": 0.8, "right_8px_level_0_at_the_start": 0.7,
+        "right_8px_level_1": 0.4, "right_8px_level_1_at_the_start": 0.3,
+    }  # fmt: skip
+
+
 def test_the_interval_of_a_gain_is_over_pairs() -> None:
     rng, judge = np.random.default_rng(1), ValidationSettings().matches
     before = rng.uniform(0.2, 0.8, 50)
@@ -424,6 +445,12 @@ def test_a_growing_set_starts_from_the_last_weights_and_replays_what_it_had(
             run(output, sequences, FakeTraining(), rounds=1, settings=default, after=before)
     with pytest.raises(InputError, match="no finished folder"):
         run(tmp_path / "other", [hall], FakeTraining(), settings=default, after=tmp_path)
+    with pytest.raises(InputError, match="trained on it, so it cannot be held back"):
+        run(tmp_path / "other", [hall], FakeTraining(), settings=default, after=before, evaluate=[walk])
+    begun = shutil.copytree(before, tmp_path / "begun")
+    shutil.rmtree(begun / "round-1")
+    with pytest.raises(InputError, match="no finished folder"):
+        run(tmp_path / "other", [hall], FakeTraining(), settings=default, after=begun)
     assert not (tmp_path / "other").exists()
     with pytest.raises(ConfigError, match="begun with"):
         run(tmp_path / "more", [hall], FakeTraining(), rounds=1, settings=default)

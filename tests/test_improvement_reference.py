@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from improvo.improvement.reference import (
     reference_parts,
     refuse_without_depth,
 )
-from improvo.improvement.settings import TRACKS, ImproveSettings, ReferenceSettings
+from improvo.improvement.settings import METRIC, TRACKS, ImproveSettings, ReferenceSettings
 from improvo.improvement.split import Split, split_last_part
 from improvo.labeling.label_sequences import label_sequences
 from improvo.labeling.labeled import LabeledSequence
@@ -148,6 +149,27 @@ def test_steps_follow_the_amount_of_video() -> None:
     assert steps_of(few, 40) == 7
     assert steps_of(replace(settings, steps_per_frame=0), 40) == 1200
     assert steps_of(replace(settings, recipe=TRACKS), 40) == 1000
+
+
+@pytest.mark.parametrize(
+    ("changes", "rounds", "recordings", "frames"),
+    [
+        # the reference, what is held back of it once more with the settings of the part, and by each candidate
+        ({}, 1, 0, 1000 + 200 + 200),
+        ({"recipe": METRIC}, 2, 0, 1000 + 200 + 2 * 200),
+        ({"recipe": TRACKS}, 1, 0, 1000 + 800 + 200 + 200),  # labels of the part that is trained on too
+        ({"recipe": TRACKS}, 2, 0, 1000 + 2 * 800 + 200 + 2 * 200),
+        ({"recipe": TRACKS, "control": True}, 1, 0, 1000 + 800 + 200 + 2 * 200),
+        # whole recordings have their labels from the reference
+        ({}, 1, 1, 1000 + 200),
+        ({"recipe": TRACKS}, 1, 1, 1000 + 200),
+        ({"recipe": TRACKS}, 2, 1, 1000 + 800 + 2 * 200),
+    ],
+)
+def test_every_labelling_is_in_the_estimate(changes: dict[str, Any], rounds: int, recordings: int, frames: int) -> None:
+    settings = replace(ImproveSettings(), **{"control": False, **changes})
+    costs = Costs.usual(640 * 480, 300_000)
+    assert estimate(settings, rounds, 800, 200, 640 * 480, costs, recordings).labeled_frames == frames
 
 
 def test_the_estimate_grows_with_the_work_and_a_full_disk_is_said_before_it(

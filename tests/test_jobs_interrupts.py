@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM are the same to a command, and neither comes in the middle of a frame."""
+"""Ctrl-C, SIGTERM and SIGHUP are the same to a command, and none comes in the middle of a frame."""
 
 from __future__ import annotations
 
@@ -9,25 +9,37 @@ import sys
 
 import pytest
 
+from improvo.cli.main import main
 from improvo.jobs.interrupts import interrupts_wait, termination_interrupts
 
+TERMINATIONS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 
 
 @pytest.fixture(autouse=True)
 def usual_handlers():
-    before = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
+    before = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     for one, handler in before.items():
         signal.signal(one, handler)
 
 
-def test_termination_is_an_interrupt_within_the_block() -> None:
+@pytest.mark.parametrize("number", TERMINATIONS)
+def test_termination_is_an_interrupt_within_the_block(number: int) -> None:
     with pytest.raises(KeyboardInterrupt), termination_interrupts():
-        os.kill(os.getpid(), signal.SIGTERM)
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+        os.kill(os.getpid(), number)
+    assert signal.getsignal(number) is signal.SIG_DFL
+
+
+def test_what_is_to_go_on_without_a_terminal_does() -> None:
+    """`nohup improvo ...`"""
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with termination_interrupts(), interrupts_wait():
+        os.kill(os.getpid(), signal.SIGHUP)
+    assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
 
 
 def test_termination_is_an_interrupt_after_colmap_was_loaded_too() -> None:
@@ -35,6 +47,7 @@ def test_termination_is_an_interrupt_after_colmap_was_loaded_too() -> None:
     program = """
 import os, signal
 from improvo.evaluation.truth.structure_from_motion import load_pycolmap
+from improvo.cli.main import main
 from improvo.jobs.interrupts import termination_interrupts
 try:
     with termination_interrupts():
@@ -55,7 +68,7 @@ def test_a_handler_of_the_program_is_left_alone() -> None:
     assert came == [signal.SIGTERM]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, *TERMINATIONS])
 def test_an_interrupt_waits_for_the_end_of_the_block(number: int) -> None:
     done: list[str] = []
 
@@ -83,3 +96,26 @@ def test_where_interrupts_are_ignored_they_stay_so() -> None:
     with interrupts_wait():
         os.kill(os.getpid(), signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+
+def test_an_interrupt_within_compiled_code_ends_a_command_as_any_other(capsys, monkeypatch, tmp_path) -> None:
+    """Numba makes a SystemError of it."""
+
+    def compiled(*_: object) -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        except KeyboardInterrupt as interrupt:
+            raise SystemError("CPUDispatcher(...) returned a result with an exception set") from interrupt
+
+    monkeypatch.setattr("improvo.cli.info.run", compiled)
+    assert main(["info", str(tmp_path)]) == 130
+    assert capsys.readouterr().err == "improvo: interrupted\n"
+
+
+def test_another_error_of_compiled_code_stays_one(monkeypatch, tmp_path) -> None:
+    def compiled(*_: object) -> None:
+        raise SystemError("something else")
+
+    monkeypatch.setattr("improvo.cli.info.run", compiled)
+    with pytest.raises(SystemError):
+        main(["info", str(tmp_path)])

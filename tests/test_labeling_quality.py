@@ -75,6 +75,12 @@ def test_each_reason_is_found_where_it_is():
     segment = np.where(np.arange(FRAMES) < 10, 0, 1)  # the map of 10 to 40 was contradicted, and started anew
     again = assess_frames(tracks, points, has_pose, np.array([40]), LabelSettings(), segment)
     assert np.flatnonzero(again.contradicted).tolist() == list(range(10, 41))
+    joined = np.where(np.arange(FRAMES) < 10, 1, np.where(np.arange(FRAMES) < 25, -1, 1))  # lost, and found again
+    again = assess_frames(tracks, points, has_pose, np.array([40]), LabelSettings(), joined)
+    assert np.flatnonzero(again.contradicted).tolist() == list(range(22, 41))
+    other = np.where(np.arange(FRAMES) < 10, 1, np.where(np.arange(FRAMES) < 15, 0, 1))  # another map lies between
+    again = assess_frames(tracks, points, has_pose, np.array([40]), LabelSettings(), other)
+    assert np.flatnonzero(again.contradicted).tolist() == list(range(15, 41))
     lost = np.where(np.arange(FRAMES) == 40, -1, segment)
     assert assess_frames(tracks, points, has_pose, np.array([40]), LabelSettings(), lost).contradicted.sum() == 19
     assert np.flatnonzero(quality.no_pose).tolist() == list(range(55, 60))

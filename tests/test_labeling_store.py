@@ -17,6 +17,7 @@ from improvo.labeling.store import (
     FAILED,
     LabelStore,
     SequenceRecord,
+    finish_sequence,
     lock_of,
     read_records,
     sequence_names,
@@ -33,7 +34,8 @@ def finish(store: LabelStore, name: str) -> None:
     folder = store.partial(name)
     folder.mkdir()
     (folder / "tracks.parquet").write_text("rows")
-    store.finish(SequenceRecord(name, f"/recordings/{name}", DONE, stable=3))
+    finish_sequence(store.folder, SequenceRecord(name, f"/recordings/{name}", DONE, stable=3))
+    store.refresh_manifest()
 
 
 def test_a_sequence_appears_when_it_is_complete(tmp_path):
@@ -103,6 +105,25 @@ def test_names_are_unique_and_the_same_each_time(tmp_path):
     assert sequence_names(paths) == names
     with pytest.raises(InputError, match="given twice"):
         sequence_names([paths[0], paths[1].parent / ".." / "one" / "rgb"])
+
+
+def test_recordings_of_a_store_keep_their_names_in_any_list(tmp_path):
+    """Many recordings are folders named `images`; a store grows by some of them at a time."""
+    folders = [tmp_path / name / "images" for name in ("a", "b", "c")]
+    for folder in folders:
+        folder.mkdir(parents=True)
+    first, second, third = folders
+    stored = [SequenceRecord(name, str(path), DONE) for name, path in sequence_names([first, second]).items()]
+    assert [record.name for record in stored] == ["images", "b-images"]
+    assert sequence_names([second, first], stored) == {"b-images": second, "images": first}
+    assert sequence_names([second], stored) == {"b-images": second}
+    assert sequence_names([third], stored) == {"c-images": third}
+    assert sequence_names([third, first, second], stored) == {"c-images": third, "images": first, "b-images": second}
+    failed = [SequenceRecord("images", str(first), FAILED, "no camera")]
+    assert sequence_names([second, first], failed) == {"b-images": second, "images": first}
+    first.rename(tmp_path / "moved")
+    with pytest.raises(InputError, match=r"named images of .*, where there is none any more; if it has moved"):
+        sequence_names([third], stored)
 
 
 def test_frames_round_trip(tmp_path):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from simulated_features import CAMERA, hand_motion, room
 
 from improvo.geometry import se3
 from improvo.odometry.settings import VerdictSettings
 from improvo.odometry.verdict.evidence import PARTS, EvidenceCheck, Spread, error_percent
-from improvo.odometry.verdict.verdict import DOUBTFUL, RIGHT, judge
+from improvo.odometry.verdict.verdict import DOUBTFUL, RIGHT, estimated_error, judge
 from improvo.odometry.view import View
 from improvo.types import Float64
 
@@ -23,12 +26,14 @@ def spread_of(
     kept: int = 250,
     seen: np.ndarray | None = None,
     shift: Float64 | None = None,
+    swaying: float = 0.0,
 ) -> Spread:
     """The spread of a path over points that are where the map says, seen with noise.
 
     Args:
         seen: (N, P) whether a point may be seen by a keyframe; None: all.
         shift: (N, 2) pixels that what lies in the upper left quarter is off by.
+        swaying: pixels (standard deviation) that everything within a block of 40 x 40 pixels is off by together.
     """
     check = EvidenceCheck(CAMERA)
     rng = np.random.default_rng(0)
@@ -40,6 +45,8 @@ def spread_of(
         keypoints = pixels[rows] + rng.normal(scale=noise, size=(len(rows), 2))
         if shift is not None:
             keypoints[(keypoints < (CAMERA.width / 2, CAMERA.height / 2)).all(axis=1)] += shift[i]
+        block = (keypoints // 40.0).astype(np.int64)
+        keypoints += np.random.default_rng(i).normal(scale=swaying, size=(6, 8, 2))[block[:, 1] % 6, block[:, 0] % 8]
         count = len(rows)
         view = View(
             i,
@@ -59,7 +66,6 @@ def spread_of(
 
 def test_parts_of_good_evidence_agree() -> None:
     spread = spread_of(TRUTH, room().points)
-    assert spread.keyframes == KEYFRAMES
     assert spread.error_percent.shape == (len(PARTS),)
     assert spread.error_percent.max() < 0.5
     assert np.abs(spread.scale_steps).max() < 0.03
@@ -85,6 +91,18 @@ def test_a_quarter_of_the_picture_that_says_otherwise_spreads_the_paths_that_hav
     assert spread.error_percent.max() > 3.0 * right.error_percent.max()
 
 
+def test_the_noise_of_keypoints_is_their_own_and_a_crowd_is_shared_by_neighbours() -> None:
+    """Noise alone, however large, leaves the estimate; the same noise in blocks of the picture raises it."""
+    own, shared = spread_of(TRUTH, room().points, noise=0.45), spread_of(TRUTH, room().points, noise=0.3, swaying=0.35)
+    assert own.shared_px < 0.1
+    assert 0.2 < shared.shared_px < 0.4
+    assert shared.noise_px < 0.0016 * CAMERA.width  # not unusual by itself
+    plain = estimated_error(replace(shared, shared_px=0.0))
+    usual = 0.0007 * CAMERA.width
+    assert estimated_error(shared) == pytest.approx(plain * (shared.shared_px / usual) ** 3)
+    assert "parts of the picture are off by" in judge(shared, VerdictSettings()).evidence[0]
+
+
 def two_scales(shared: int) -> tuple[Float64, Float64, np.ndarray]:
     """A map whose second half is half as large again; so many points are seen on both sides of the change.
 
@@ -97,7 +115,9 @@ def two_scales(shared: int) -> tuple[Float64, Float64, np.ndarray]:
     cam_from_world = TRUTH.copy()
     centers = centre + 1.5 * (se3.inverse(TRUTH[cut:])[:, :3, 3] - centre)
     cam_from_world[cut:, :3, 3] = -np.einsum("nij,nj->ni", TRUTH[cut:, :3, :3], centers)
-    both = se3.transform(se3.inverse(TRUTH[cut]), np.array([[0.3 * i - 0.6, 0.1 * i, 4.0] for i in range(shared)]))
+    both = se3.transform(
+        se3.inverse(TRUTH[cut]), np.array([[0.3 * i - 0.6, 0.1 * i, 4.0] for i in range(shared)]).reshape(-1, 3)
+    )
     xyz = np.concatenate([first, centre + 1.5 * (second - centre), both.reshape(-1, 3)])
     before = np.arange(KEYFRAMES)[:, None] < cut
     point = np.arange(len(xyz))[None]
@@ -111,6 +131,22 @@ def test_a_scale_that_few_points_carry_on_is_marked_and_not_smoothed_over() -> N
     first, last = verdict.uncertain[0]
     assert first < KEYFRAMES // 2 <= last
     assert verdict.error_percent > 4.0
+
+
+def test_a_gap_that_no_point_bridges_makes_a_segment_doubtful_where_much_lies_on_both_sides() -> None:
+    cam_from_world, xyz, seen = two_scales(shared=0)
+    verdict = judge(spread_of(cam_from_world, xyz, seen=seen), VerdictSettings())
+    cut = KEYFRAMES // 2
+    assert verdict.word == DOUBTFUL
+    assert f"between frames {cut - 1} and {cut} is known to" in verdict.evidence[0]
+    ((first, last),) = verdict.uncertain
+    assert first < cut <= last
+    # of 30 keyframes, the last one alone lies beyond the gap
+    late = np.ones((KEYFRAMES, len(xyz)), bool)
+    late[:-1, : len(xyz) // 2], late[-1, len(xyz) // 2 :] = False, False
+    spread = spread_of(TRUTH, room().points, seen=late[:, : len(room().points)])
+    assert judge(spread, VerdictSettings()).uncertain[-1][-1] == KEYFRAMES - 1
+    assert estimated_error(spread) < verdict.error_percent / 3.0
 
 
 def test_parts_that_disagree_about_the_scale_make_a_segment_doubtful() -> None:

@@ -87,6 +87,9 @@ def test_a_refused_frame_changes_no_later_pose(walk: Sequence) -> None:
             for time in (float("nan"), float("-inf"), "1", None, 10**400):
                 with pytest.raises(InputError, match="finite time in seconds"):
                     disturbed.track(frame(one.image, time=time))  # type: ignore[arg-type]
+            for time in (frames[number - 1].time, frames[number - 1].time - 1):
+                with pytest.raises(InputError, match=r"the frame before was at .*; times of frames increase"):
+                    disturbed.track(frame(one.image, time=time))
         disturbed.track(one)
     for running in (plain, disturbed):
         running.finish()
@@ -107,7 +110,14 @@ def test_features_that_do_not_fit_are_refused_and_forgotten() -> None:
     ):
         with pytest.raises(InputError, match="features: "):
             running.track_features(bad, 1.0)
+    for time in (0.0, -1.0):
+        with pytest.raises(InputError, match="times of frames increase"):
+            running.track_features(good, time)
     assert running.track_features(good, 1.0).frame_index == 1
+    matched = running.match(good)
+    with pytest.raises(InputError, match="times of frames increase"):
+        running.track_matched(matched, 1.0)
+    assert running.track_matched(matched, 2.0).frame_index == 2
 
 
 def test_after_the_end_every_way_in_is_closed() -> None:

@@ -97,6 +97,34 @@ def test_tracks_have_the_labels_that_they_have_all_at_once(
     assert writer.counts["stable"] == (points.stability == 2).sum()
 
 
+def test_tracks_that_never_end_are_joined_once_a_flush(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A logo or a time stamp is one track of the whole recording, and is carried along to its end."""
+    monkeypatch.setattr(recorder, "_FLUSH_EVERY", 10)
+    joined = []
+    join = recorder._Rows.joined
+    monkeypatch.setattr(recorder._Rows, "joined", lambda parts: joined.append(len(parts)) or join(parts))
+    rng = np.random.default_rng(0)
+    keypoints = rng.uniform(0, 400, (5, 2))
+    views = []
+    for frame in range(100):
+        pose = np.eye(4)
+        pose[0, 3] = 0.001 * frame
+        short = np.arange(100 + frame - frame % 20, 103 + frame - frame % 20)
+        tracks = np.concatenate([np.arange(2), short])
+        views.append(FinalView(frame, frame / 30, 0, pose, keypoints, tracks, np.full(5, -1), np.ones(5)))
+    late = [*views[:30], *views[31:90], views[30], *views[90:]]  # of frame 31 on nothing is finished for long
+    record(tmp_path / "late", late, np.diag([500.0, 500, 1]))
+    flushes = len(joined)
+    record(tmp_path / "out", views, np.diag([500.0, 500, 1]))
+    assert flushes <= 8
+    assert joined[flushes:] == [11] * 10 + [1]
+    for folder in ("late", "out"):
+        points, table = read_points(tmp_path / folder / POINTS_FILE), read_tracks(tmp_path / folder / TRACKS_FILE)
+        np.testing.assert_array_equal(points.observations, [100, 100] + [20] * 15)
+        np.testing.assert_array_equal(table.frame[:200], np.tile(np.arange(100), 2))
+        np.testing.assert_array_equal(table.keypoints[:100], np.tile(keypoints[:1].astype(np.float32), (100, 1)))
+
+
 def test_a_failure_leaves_no_file(tmp_path: Path) -> None:
     tracks, cam_from_world, K = scene()
     views = final_views(tracks, cam_from_world)

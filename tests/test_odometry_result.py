@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from simulated_features import CAMERA
@@ -12,8 +14,9 @@ from improvo.odometry.events import EventLog
 from improvo.odometry.map_builder import MapBuilder
 from improvo.odometry.mapping.window import WindowReport
 from improvo.odometry.result import OdometryResult
-from improvo.odometry.segments import SegmentPlacement
+from improvo.odometry.segments import Segment, SegmentPlacement
 from improvo.odometry.trajectory_builder import FinalView, TrajectoryBuilder
+from improvo.odometry.verdict.verdict import DOUBTFUL, Verdict
 from improvo.odometry.view import View
 from improvo.types import Float64
 
@@ -72,6 +75,18 @@ class TestEvents:
         log.initialisation_failed(4, "too few matches")
         assert [event.frame_index for event in log.events] == [0, 4]
 
+    def test_what_was_told_of_a_segment_is_not_told_again_when_it_is_joined(self) -> None:
+        log = EventLog()
+        first = Segment(0, 0, 9, 10, 0.5, "lost", Verdict(DOUBTFUL, 9.0, 0.3, ("bad",), ((2, 4),)))
+        log.judged(first)
+        both = Verdict(DOUBTFUL, 9.0, 0.3, ("bad",), ((2, 4), (22, 25)))
+        log.judged(replace(first, last=30, frames=20, verdict=both))
+        assert [(event.frame_index, event.kind) for event in log.events] == [
+            (2, "uncertain"),
+            (9, "doubtful"),
+            (22, "uncertain"),
+        ]
+
 
 class TestPlacement:
     def test_the_first_segment_is_the_shared_world(self) -> None:
@@ -91,6 +106,15 @@ class TestPlacement:
         placement = SegmentPlacement()
         placement.place(np.eye(4), np.array([3.0]))
         placement.place(np.eye(4), np.zeros(0))
+        placement.begin_next()
+        assert placement.similarity.scale == 3.0
+
+    def test_points_behind_the_camera_do_not_turn_the_next_segment_inside_out(self) -> None:
+        placement = SegmentPlacement()
+        placement.place(np.eye(4), np.array([-2.0, -1.0, 3.0]))
+        placement.begin_next()
+        assert placement.similarity.scale == 3.0
+        placement.place(np.eye(4), np.array([-2.0, 0.0]))
         placement.begin_next()
         assert placement.similarity.scale == 3.0
 

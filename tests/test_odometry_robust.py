@@ -57,6 +57,7 @@ def contradicts_at(monkeypatch: pytest.MonkeyPatch, *frame_indices: int) -> None
 
     class Check:
         ambiguous = False
+        has_judged = True
 
         def __init__(self, *_: object) -> None:
             pass
@@ -68,6 +69,14 @@ def contradicts_at(monkeypatch: pytest.MonkeyPatch, *frame_indices: int) -> None
             return True
 
     monkeypatch.setattr(robust, "HealthCheck", Check)
+
+
+def test_a_map_of_a_long_start_is_checked_before_it_is_trusted() -> None:
+    still = [observe(room(), TRUTH[0], seed=1000 + i) for i in range(90)]
+    run = Run([*still, *walk(60)])
+    start = run.states.index(PROVISIONAL)
+    assert start > 90
+    assert run.states.index(TRACKING) - start > 10
 
 
 def test_a_walk_initialises_is_provisional_and_then_tracks() -> None:

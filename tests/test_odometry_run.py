@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from rendered_walk import write_walk
 
+from improvo.errors import InputError
+from improvo.frontend.registry import frontend_from
 from improvo.geometry.camera import Camera
 from improvo.odometry.run import run_odometry
 from improvo.odometry.run_folder import RunFolder
@@ -19,7 +21,7 @@ from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
 from improvo.odometry.visual_odometry import TrackedFrame
 from improvo.sequences import open_sequence
-from improvo.types import Float64, Frame
+from improvo.types import Features, Float64, Frame, UInt8
 
 ORB = FrontendSettings(name="orb", max_keypoints=400)
 
@@ -67,6 +69,35 @@ def test_a_visualizer_sees_every_frame_with_its_segment_and_world(with_a_dark_fr
     assert segments == RunFolder(tmp_path / "out").trajectory.segment.tolist()
     worlds = [world for _, _, world in watcher.shown]
     assert [a != b for a, b in itertools.pairwise(segments)] == [a != b for a, b in itertools.pairwise(worlds)]
+
+
+def test_a_visualizer_is_told_of_the_end_also_after_an_error(with_a_dark_frame: Path, tmp_path: Path) -> None:
+    """A recording of Rerun is whole only then."""
+
+    class Broken:
+        name = "broken"
+
+        def __init__(self) -> None:
+            self.frames = 0
+
+        def __call__(self, image: UInt8) -> Features:
+            self.frames += 1
+            if self.frames > 5:
+                raise InputError("the frontend is broken")
+            return frontend_from(ORB)(image)
+
+    watcher = Watcher()
+    with pytest.raises(InputError, match="is broken"):
+        run_odometry(
+            open_sequence(with_a_dark_frame),
+            tmp_path / "out",
+            RunSettings(),
+            frontend=Broken(),
+            visualizer=watcher,
+        )
+    assert watcher.told[0] == "begin"
+    assert watcher.told[-1] == "end"
+    assert watcher.told.count("end") == 1
 
 
 def test_a_segment_in_which_nothing_was_measured_has_no_error(with_a_dark_frame: Path, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from improvo.geometry.trajectory_files import read_trajectory, write_trajectory
 from improvo.odometry.map_file import read_map
 from improvo.odometry.run import RunSummary
 from improvo.odometry.run_folder import RunFolder
-from improvo.odometry.scale.apply import apply_scale, segment_maps
+from improvo.odometry.scale.apply import apply_scale, scaled_trajectory, segment_maps
 from improvo.odometry.scale.estimate import ScaleEstimate, from_measurements
 from improvo.odometry.scale.from_distance import scale_from_distance
 from improvo.odometry.scale.from_height import ground_plane
@@ -314,6 +314,22 @@ def test_each_segment_is_scaled_about_where_it_began() -> None:
     assert segment_maps(trajectory, {0: ScaleEstimate(10.0, None, 1)})[1].factor == 10.0
 
 
+def test_a_segment_begins_where_the_camera_was_also_where_an_earlier_one_goes_on_after_it() -> None:
+    """Frames 0 to 9 and 20 to 29 are of segment 0, which was seen again; 10 to 19 of segment 1, 30 and on of 2."""
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, 0, 3] = np.arange(40)
+    segment = np.repeat([0, 1, 0, 2], 10)
+    segment[9] = -1
+    poses[9] = np.nan
+    trajectory = Trajectory(np.arange(40.0), poses, segment)
+    maps = segment_maps(trajectory, {number: ScaleEstimate(2.0 + 2 * number, None, 1) for number in range(3)})
+    x = scaled_trajectory(trajectory, maps).world_from_cam[:, 0, 3]
+    np.testing.assert_allclose(x[:9], 2 * np.arange(9))
+    np.testing.assert_allclose(x[10:20], 16 + 4 * (np.arange(10, 20) - 8))
+    np.testing.assert_allclose(x[20:30], 2 * np.arange(20, 30))
+    np.testing.assert_allclose(x[30:], 58 + 6 * (np.arange(30, 40) - 29))
+
+
 def test_the_error_of_a_median_and_its_change() -> None:
     rng = np.random.default_rng(0)
     medians, errors = [], []
@@ -355,6 +371,13 @@ def test_settings_are_checked() -> None:
         {"source": "distance", "distances": ((1, 2, -3.0),)},
         {"source": "truth", "began": "12.5"},
         {"source": "marker", "metres": float("nan")},
+        {"metres": 1.0},
+        {"source": "depth", "metres": 1.0},
+        {"source": "distance", "distances": ((1, 2, 3.0),), "metres": 1.0},
+        {"source": "truth", "metres": 1.0},
+        {"reference": "gps.gpx"},
+        {"source": "height", "metres": 1.0, "reference": "gps.gpx"},
+        {"source": "depth", "marker_dictionary": "DICT_4X4_50"},
     ):
         with pytest.raises(ConfigError):
             ScaleSettings(**wrong)  # type: ignore[arg-type]

@@ -9,6 +9,7 @@ import pytest
 from simulated_features import CAMERA, World, error_percent, hand_motion, nothing_to_see, observe, room, views_of, wall
 
 from improvo.geometry import se3
+from improvo.odometry.gates import MEMORY_FRAMES
 from improvo.odometry.mapping.initial_pair import InitFailure, InitialPair, initial_pair
 from improvo.odometry.mapping.local_map import LocalMap
 from improvo.odometry.mapping.start import start_map
@@ -68,6 +69,15 @@ def test_the_world_is_the_first_camera_and_the_median_depth_in_it_is_one() -> No
     np.testing.assert_allclose(views[0].cam_from_world, np.eye(4), atol=1e-12)
     depths = local_map.store.xyz[views[0].points[views[0].observed], 2]
     assert np.median(depths) == pytest.approx(1.0)
+
+
+def test_the_memory_of_a_new_map_is_that_of_its_last_frames_in_their_order() -> None:
+    truth = np.concatenate([np.repeat(moving(1), 70, axis=0), moving(30)])
+    views = walk(room(), truth)
+    local_map = started(views)
+    assert [view.frame_index for view in local_map.history] == [view.frame_index for view in views[-MEMORY_FRAMES:]]
+    newest = views[-1]
+    assert (local_map.store.last_seen[newest.points[newest.observed]] == newest.frame_index).all()
 
 
 def test_a_pure_rotation_starts_nothing_and_leaves_nothing() -> None:
@@ -171,3 +181,30 @@ def test_a_tolerance_within_which_a_rotation_explains_the_matches_starts_nothing
     assert isinstance(pair_of(views), InitialPair)
     generous = replace(SETTINGS, tolerance=50.0)
     assert pair_of(views, generous) == InitFailure("too little parallax: a rotation explains the motion")
+
+
+def test_repeated_texture_that_looks_like_a_motion_starts_nothing_where_tracks_only_turn() -> None:
+    """Most matches are one repetition off and say that the camera moved; what was tracked says that it turned."""
+    turned, moved = turning(4)[[0, -1]], moving(12)[[0, -1]]
+    moved[0] = turned[0]
+    turned_views = views_of([observe(room(0), pose, seed=i, limit=120) for i, pose in enumerate(turned)])
+    moved_views = views_of([observe(room(1), pose, seed=i, limit=400) for i, pose in enumerate(moved)])
+    for tracked, word in ((False, InitFailure), (True, InitialPair)):
+        views = []
+        for i, (a, b) in enumerate(zip(turned_views, moved_views, strict=True)):
+            tracks = b.tracks if tracked else 1000 * i + np.arange(len(b))
+            views.append(
+                View(
+                    frame_index=i,
+                    time=i / 30.0,
+                    keypoints=np.concatenate([a.keypoints, b.keypoints]),
+                    descriptors=np.concatenate([a.descriptors, b.descriptors]),
+                    weights=np.ones(len(a) + len(b)),
+                    tracks=np.concatenate([a.tracks, 10_000 + tracks]),
+                    points=np.full(len(a) + len(b), -1, np.int64),
+                )
+            )
+        result = pair_of(views)
+        assert isinstance(result, word), result
+        if isinstance(result, InitFailure):
+            assert result.reason == "too little parallax: a rotation explains the tracks"

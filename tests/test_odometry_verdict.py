@@ -26,8 +26,6 @@ GOOD = Spread(
     link_frames=np.array([[0, 20], [10, 30]]),
     noise_px=0.3,
     width=640,
-    fewest=100,
-    keyframes=24,
 )
 
 
@@ -137,6 +135,14 @@ def test_joined_stretches_take_the_worse_verdict_and_name_the_scale_between_them
     assert both.evidence[-1] == "joined, scale ±1 %"
     assert joined(good, good, 0.04).error_percent == pytest.approx(2.0)
     assert joined(good, Verdict(NOT_JUDGED), 0.01).word == RIGHT
+    zoomed = Verdict(DOUBTFUL, 0.5, 0.3, ("the focal length changed",))
+    for both in (joined(good, zoomed, 0.01), joined(zoomed, good, 0.01)):
+        assert both.word == DOUBTFUL
+        assert both.evidence[0] == "the focal length changed"
+        assert both.error_percent == max(good.error_percent, 0.5)
+    unknown = Verdict(DOUBTFUL, float("nan"), float("nan"), ("too few keyframes",))
+    assert joined(unknown, good, 0.01).error_percent == good.error_percent
+    assert joined(bad, zoomed, 0.01).evidence[:2] == (bad.evidence[0], "the focal length changed")
 
 
 def test_run_json_has_no_nan_and_tells_frames_and_lines() -> None:

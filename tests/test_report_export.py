@@ -18,11 +18,11 @@ import pytest
 from improvo.cli.main import main
 from improvo.export.model import segment_model
 from improvo.export.trajectory import export_trajectory
-from improvo.odometry.map_file import read_map
+from improvo.odometry.map_file import read_map, write_map
 from improvo.odometry.run_folder import RunFolder
 from improvo.sequences import open_sequence, read_trajectory
 from improvo.stability.tables import read_tracks
-from improvo.types import Trajectory
+from improvo.types import SparseMap, Trajectory
 
 
 def test_map_is_read_back_as_it_was_written(finished_run: Path) -> None:
@@ -32,6 +32,45 @@ def test_map_is_read_back_as_it_was_written(finished_run: Path) -> None:
     assert np.isfinite(run.map.mean_error).all()
     depth = run.map.xyz[:, 2]
     assert 0.3 < np.median(depth) < 5, "the map is scaled to an initial median depth of 1"
+
+
+def a_map(ids: list[int]) -> SparseMap:
+    """One point for each id, whose colour tells its id."""
+    count = len(ids)
+    shades = np.repeat(np.array(ids, np.uint8)[:, None], 3, axis=1)
+    ones, zeros = np.ones(count), np.zeros(count, np.int64)
+    return SparseMap(np.array(ids, np.int64), np.ones((count, 3)), zeros + 2, ones, ones, zeros, shades)
+
+
+def test_a_map_keeps_the_ids_of_its_points(tmp_path: Path) -> None:
+    """Points that no final frame sees are left out, so the rows are not the ids."""
+    write_map(tmp_path / "map.ply", a_map([2, 3, 7]))
+    read = read_map(tmp_path / "map.ply")
+    np.testing.assert_array_equal(read.ids, [2, 3, 7])
+    np.testing.assert_array_equal(read.rows_of(np.array([7, 0, 3, -1, 8, 2])), [2, -1, 1, -1, -1, 0])
+    np.testing.assert_array_equal(a_map([7, 2, 3]).rows_of(np.array([2, 3, 7, 4])), [1, 2, 0, -1])
+    np.testing.assert_array_equal(a_map([]).rows_of(np.array([0, -1])), [-1, -1])
+
+
+@pytest.mark.parametrize("with_ids", [True, False])
+def test_exported_points_have_the_colours_of_their_own_map_points(
+    with_ids: bool, finished_run: Path, tmp_path: Path
+) -> None:
+    """Whichever points the map holds. One from before ids were written leaves all of them grey."""
+    folder = tmp_path / "run"
+    shutil.copytree(finished_run, folder)
+    points = RunFolder(folder).points
+    kept = [int(point) for point in np.unique(points.point) if 0 <= point < 256 and point % 3 != 1]
+    write_map(folder / "map.ply", a_map(kept))
+    if not with_ids:
+        content = (folder / "map.ply").read_bytes()
+        (folder / "map.ply").write_bytes(content.replace(b"property int id\n", b"property int other\n"))
+    rgb = segment_model(RunFolder(folder), 0, max_error=np.inf, min_observations=0).rgb
+    usable = (points.segment == 0) & np.isfinite(points.xyz).all(axis=1)
+    owner = points.point[usable]
+    expected = np.where(np.isin(owner, kept if with_ids else []), owner, 128)
+    np.testing.assert_array_equal(rgb, np.repeat(expected[:, None], 3, axis=1))
+    assert (expected != 128).any() == with_ids
 
 
 def test_a_damaged_map_is_named(finished_run: Path, tmp_path: Path) -> None:

@@ -145,6 +145,34 @@ def test_many_recordings_get_a_camera_each(
         improvo.open_sequence(tmp_path / "dull", settings)
 
 
+def test_a_plan_finds_the_camera_and_the_command_after_it_takes_that(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = counted(monkeypatch)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    shutil.copytree(walk, tmp_path / "other")
+    words = ["label", str(walk), "--camera", "auto", "--frontend", "orb", "--max-keypoints", "300"]
+    assert main([*words, "--plan"]) == 0
+    assert "all: 1 recording, 45 frames" in capsys.readouterr().out
+    assert main([*words, "-o", str(tmp_path / "labels")]) == 0
+    assert len(asked) == 1
+    assert load_calibration(str(tmp_path / "labels" / "camera.yaml")).camera(320, 240).fx == 260.0
+    monkeypatch.setattr("improvo.improvement.plan_sample.installed", lambda name: False)  # a sample takes minutes
+    words = ["improve", str(walk), "--evaluate", str(tmp_path / "other"), "--camera", "auto", "--plan"]
+    assert main([*words, "--frontend", "superpoint-small", "--max-keypoints", "100"]) == 0
+    assert "labelling: 90 frames" in capsys.readouterr().out
+    assert [path.name for path in asked] == ["walk", "walk", "other"]
+
+
+def test_features_are_exported_with_a_found_camera(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("h5py")
+    counted(monkeypatch)
+    out = tmp_path / "scene"
+    words = ["export", "features", str(walk), "--camera", "auto", "--layout", "hloc", "--max-frames", "4"]
+    assert main([*words, "--frontend", "orb", "--no-images", "-o", str(out)]) == 0
+    assert load_calibration(str(out / "camera.yaml")).camera(320, 240).fx == 260.0
+
+
 def test_python_finds_and_keeps_it_too(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     counted(monkeypatch)
     settings = improvo.RunSettings(
@@ -228,3 +256,24 @@ def test_real_recording(shared_data: Path, tmp_path: Path) -> None:
     assert found.camera.fx == pytest.approx(published.fx, rel=0.015)
     assert found.camera.fy == pytest.approx(published.fy, rel=0.015)
     assert found.focal_deviation < 0.02
+
+
+def test_a_stop_between_a_camera_and_its_figures_leaves_no_camera_of_another_recording(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = counted(monkeypatch)
+    out, other = tmp_path / "out", tmp_path / "other"
+    out.mkdir()
+    shutil.copytree(walk, other)
+    find_cameras([walk], SequenceSettings(camera="auto"), out)
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("improvo.self_calibration.from_motion.write_json", stop)
+        with pytest.raises(KeyboardInterrupt):
+            find_cameras([other], SequenceSettings(camera="auto"), out)
+    assert (out / "camera.yaml").is_file()  # of the other recording
+    find_cameras([walk], SequenceSettings(camera="auto"), out)
+    assert asked == [walk, other, walk]

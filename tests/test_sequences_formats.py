@@ -158,6 +158,21 @@ def test_a_recording_opens_without_a_calibration(tmp_path: Path) -> None:
     assert (recording.image(2) == images(3)[2]).all()
 
 
+def test_a_writer_that_is_killed_leaves_no_lists_of_an_earlier_recording(tmp_path: Path) -> None:
+    """They would name pictures of both."""
+    with TumRgbdWriter(tmp_path, CAMERA) as writer:
+        for i, image in enumerate(images(COUNT)):
+            writer.add(i / 10, image, depths(COUNT)[i], poses(COUNT)[i])
+    killed = TumRgbdWriter(tmp_path, CAMERA)
+    killed.add(0.0, 255 - images(COUNT)[0])
+    assert not {"rgb.txt", "depth.txt", "groundtruth.txt"} & {path.name for path in tmp_path.iterdir()}
+    killed.close()
+    sequence = open_sequence(tmp_path)
+    assert len(sequence) == 1
+    assert sequence.ground_truth is None
+    assert sequence.depth(0) is None
+
+
 def test_an_interrupted_writer_leaves_a_valid_shorter_sequence(tmp_path: Path) -> None:
     def interrupted() -> None:
         with TumRgbdWriter(tmp_path, CAMERA) as writer:

@@ -8,13 +8,14 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from improvo.errors import InputError
 from improvo.sequences import live, open_sequence
-from sequence_builders import images, write_video
+from sequence_builders import images, write_images, write_video
 
 
 class FakeCamera:
@@ -65,6 +66,40 @@ def test_max_frames_and_stopping_early_let_go_of_the_camera(camera: FakeCamera) 
     assert camera.released
 
 
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"start": 3}, "0: is live, so `start` cannot be used"),
+        ({"end": 5}, "0: is live, so `end` cannot be used.*or after `max_frames`"),
+        ({"end": 0}, "0: is live, so `end` cannot be used"),
+        ({"stride": 0}, "0: stride 0 must be at least 1"),
+        ({"max_frames": 0}, "0: max_frames 0 must be at least 1"),
+        ({"mask": "masks"}, "masks: is a folder, and 0 is live; give one mask for all frames"),
+        ({"fov": None}, "0: has no calibration"),
+    ],
+)
+def test_what_needs_a_recording_is_refused_and_the_camera_let_go(
+    settings: dict[str, Any], said: str, camera: FakeCamera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_images(tmp_path / "masks", [np.full((48, 64), 255, np.uint8)])
+    with pytest.raises(InputError, match=said):
+        open_sequence("0", **{"fov": 60.0, **settings})
+    assert camera.released
+
+
+def test_one_mask_and_a_stride_serve_a_live_stream(camera: FakeCamera, tmp_path: Path) -> None:
+    white = np.full((48, 64), 255, np.uint8)
+    white[:, :32] = 0
+    write_images(tmp_path, [white], "mask{}.png")
+    frames = list(open_sequence("0", fov=60.0, mask=str(tmp_path / "mask0.png"), stride=2, max_frames=3))
+    assert len(frames) == 3
+    assert all(frame.source_index % 2 == 0 for frame in frames)
+    assert frames[0].mask is not None
+    assert not frames[0].mask[:, :32].any()
+    assert frames[0].mask[:, 40:].all()
+
+
 def test_a_camera_that_is_unplugged_ends_the_sequence(camera: FakeCamera) -> None:
     camera.count = 5
     frames = list(open_sequence("0", fov=60.0))
@@ -113,8 +148,6 @@ def test_http_stream(server: str) -> None:
 
 
 def test_a_folder_named_by_a_number_is_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from sequence_builders import write_images
-
     write_images(tmp_path / "07", images(3))
     monkeypatch.chdir(tmp_path)
     assert open_sequence("07", fov=60.0).format == "images"

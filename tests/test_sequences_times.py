@@ -100,6 +100,13 @@ def test_names_that_are_counts_or_dates_of_the_calendar_are_no_stamps(tmp_path: 
         ([0, 33_333, 66_667], "microseconds"),
         ([0, 33_333_333, 66_666_667], "nanoseconds"),
         ([500, 1000, 1500], "milliseconds"),
+        (np.rint(np.arange(100) * 1000 / 200), "milliseconds"),
+        (np.rint(np.arange(100) * 1000 / 120), "milliseconds"),
+        (np.rint(np.arange(100) * 1000 / 30), "milliseconds"),
+        (np.rint(np.arange(100) * 1000 / 15), "milliseconds"),
+        (np.arange(100) * 333.0, "milliseconds"),
+        ([0, 2, 4, 6], "seconds"),
+        ([0.001, 10, 20, 30], "seconds"),
         ([1.7e9, 1.7e9 + 1], "seconds"),
         ([1.7e18, 1.7e18 + 5e7], "nanoseconds"),
         ([np.nan], "seconds"),
@@ -107,6 +114,27 @@ def test_names_that_are_counts_or_dates_of_the_calendar_are_no_stamps(tmp_path: 
 )
 def test_units_by_size(stamps: list[float], unit: str) -> None:
     assert unit_of(np.array(stamps, np.float64)) == unit
+
+
+def test_milliseconds_from_0_are_read_as_such_and_a_note_tells_what_to_do_about_a_time_lapse(tmp_path: Path) -> None:
+    path = folder(tmp_path / "s", "".join(f"{33 * i}\n" for i in range(COUNT)))
+    (path / "groundtruth.txt").write_text(trajectory_text(0.033 * np.arange(COUNT), 1e3))
+    sequence = open_sequence(path, fov=60.0)
+    np.testing.assert_allclose(sequence.times, 0.033 * np.arange(COUNT))
+    assert sequence.ground_truth is not None
+    assert sequence.ground_truth.valid.all()
+    assert any("taken as milliseconds" in note and "time lapse" in note for note in sequence.notes)
+    assert open_sequence(path, fov=60.0, fps=0.1).times[1] == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize("stamps", [[0, 5, 10, 15], [0, 30, 60, 90]])
+def test_places_and_counts_in_steps_are_no_milliseconds(stamps: list[int], tmp_path: Path) -> None:
+    """A GPS receiver that writes every 5 s, and pictures of which every 30th was kept."""
+    assert unit_of(np.array(stamps, np.float64), of_video=False) == "seconds"
+    for number, picture in zip(stamps, images(4), strict=True):
+        write_images(tmp_path / "s", [picture], f"{number:012d}.png")
+    assert open_sequence(tmp_path / "s", fov=60.0, fps=20.0).times[1] == pytest.approx(0.05)
+    assert not any("time stamps in" in note for note in open_sequence(tmp_path / "s", fov=60.0).notes)
 
 
 @pytest.mark.parametrize(

@@ -126,18 +126,6 @@ def test_no_tracks():
     assert len(label_stability(empty, poses, segment, K)) == 0
 
 
-def test_points_of_the_map_are_measured_not_solved():
-    tracks, poses, segment, K = simulated_tracks()
-    solved = label_stability(tracks, poses, segment, K)
-    given = np.full_like(solved.xyz, np.nan)
-    given[3] = solved.xyz[3] + (0.5, 0.0, 0.0)
-    labels = label_stability(tracks, poses, segment, K, point_xyz=given, point=np.arange(len(solved)))
-    np.testing.assert_array_equal(labels.xyz[3], given[3])
-    assert labels.stability[3] == UNSTABLE
-    assert (np.delete(labels.stability, 3) == STABLE).all()
-    assert labels.point.tolist() == list(range(len(solved)))
-
-
 @pytest.mark.parametrize("values", [{"min_observations": 1}, {"stable_mean_error": 6.0}, {"loss": "l2"}])
 def test_impossible_settings_are_refused(values):
     with pytest.raises(ConfigError):

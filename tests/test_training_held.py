@@ -27,10 +27,12 @@ from improvo.training.held_training import train_held  # noqa: E402
 from improvo.training.losses import held_loss, info_nce_loss  # noqa: E402
 from improvo.training.mixed_pairs import MixedPairs  # noqa: E402
 from improvo.training.pack import read_pack, write_pack  # noqa: E402
+from improvo.training.pair_points import PairPlan, PairPoints  # noqa: E402
 from improvo.training.photometric_batch import augment_batch  # noqa: E402
 from improvo.training.picture_store import DepthStore, PictureStore  # noqa: E402
 from improvo.training.pictures import Pictures, Source  # noqa: E402
 from improvo.training.posed import overlapping_pairs  # noqa: E402
+from improvo.training.posed_frames import PosedFrames  # noqa: E402
 from improvo.training.random_views import random_views  # noqa: E402
 from improvo.training.settings import OptimiserSettings, PhotometricSettings, ViewSettings  # noqa: E402
 from improvo.training.stage import Stage  # noqa: E402
@@ -282,6 +284,29 @@ def test_keypoints_that_the_other_view_does_not_show_lie_outside_of_it() -> None
             assert not inside(elsewhere, 128, 96, margin=-8.0).any()
 
 
+def test_what_is_behind_the_camera_is_far_outside_and_not_shown() -> None:
+    behind = np.eye(4)
+    behind[2, 3] = -10
+    frames = PosedFrames([posed_room(2)], CPU)
+    carried = frames.carry(np.array([[0, 1]]), torch.tensor([[[50.0, 50.0]]]), torch.tensor([[0.5]]), behind[None])
+    assert not carried.ahead.any()
+    assert (carried.places < -1000).all()
+    room = posed_room(2)
+    poses = room.world_from_cam.copy()
+    poses[1] = poses[0] @ np.diag([-1.0, 1.0, -1.0, 1.0])  # frame 1 looks the other way
+    turned = replace(room, world_from_cam=poses)
+    pictures = PictureStore(list(room.pictures), CPU)
+    points = PairPoints(pictures, PosedFrames([turned], CPU), None, SMALL)
+    H = np.diag([0.5, 0.5, 1.0])  # what lies right before the corner of the picture is near that of the view
+    views = np.stack([np.eye(3), H])
+    plan = PairPlan(np.array([[0, 1]]), np.zeros(1, np.int64), np.eye(3)[None], views, 1, SIZE)
+    places = torch.rand(1, 300, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([159.0, 119.0])
+    seen = points._in_pictures(plan, places)
+    known = seen.posed.inverse_depth > 0
+    assert known.float().mean() > 0.5
+    assert torch.equal(points._absent(plan, seen), known)
+
+
 def test_frames_that_share_nothing_make_no_pair() -> None:
     room = posed_room(3)
     apart = replace(room, world_from_cam=room.world_from_cam + 10 * np.eye(4, k=3) * np.arange(3)[:, None, None])
@@ -292,6 +317,11 @@ def test_frames_that_share_nothing_make_no_pair() -> None:
     assert overlapping_pairs(room, DevicePairSettings(largest_gap=0.5)) is None
     with pytest.raises(InputError, match="nothing to train on"):
         DevicePairs(Pictures(()), [], SMALL, no_keypoints, None, CPU)
+    for two_frames in (True, False):
+        settings = replace(SMALL, pairs=replace(SMALL.pairs, two_frames=two_frames))
+        with pytest.raises(InputError, match="no two frames of room-0 show enough of the same places; give pictures"):
+            DevicePairs(Pictures(()), [apart], settings, no_keypoints, None, CPU)
+        assert len(DevicePairs(Pictures((photographs(),)), [apart], settings, no_keypoints, None, CPU)[0]["valid"]) == 4
 
 
 def test_pairs_of_the_same_scene_are_not_each_others_negatives() -> None:
@@ -382,9 +412,29 @@ def test_a_pack_gives_back_what_was_packed(tmp_path: Path) -> None:
     assert posed[0].size == SIZE
     assert np.array_equal(posed[0].world_from_cam, room.world_from_cam)
     assert np.allclose(posed[0].inverse_depth[2], room.inverse_depth[2], atol=2e-4)
+    assert pictures.skipped == posed[0].masks == pictures.sources[0].masks == ()
     (tmp_path / "other.zip").write_text("no")
     with pytest.raises(InputError, match="no pack"):
         read_pack(tmp_path / "other.zip")
+
+
+def test_a_pack_keeps_masks_weights_and_names(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    source, room = photographs(2), replace(posed_room(3), weight=0.3)
+    source = replace(source, names=("a.jpg", "b.jpg"), masks=tuple(rng.random((150, 200)) < 0.5 for _ in range(2)))
+    room = replace(room, masks=tuple(rng.random((120, 160)) < 0.5 for _ in range(3)))
+    write_pack(tmp_path / "pack.zip", Pictures((source, photographs(1)), ("broken.jpg",)), [room, posed_room(3)], ())
+    pictures, posed, _ = read_pack(tmp_path / "pack.zip")
+    assert pictures.skipped == ("broken.jpg",)
+    assert [one.names for one in pictures.sources] == [("a.jpg", "b.jpg"), ("",)]
+    assert [one.weight for one in posed] == [0.3, 1.0]
+    for before, after in ((source, pictures.sources[0]), (room, posed[0])):
+        assert all(mask.dtype == np.bool_ for mask in after.masks)
+        np.testing.assert_array_equal(before.masks, after.masks)
+    assert pictures.sources[1].masks == posed[1].masks == ()
+    with pytest.raises(ValueError, match="zip"):
+        write_pack(tmp_path / "wrong.zip", Pictures((replace(source, masks=source.masks[:1]),)), [], ())
+    assert not (tmp_path / "wrong.zip").exists()
 
 
 @pytest.mark.parametrize(

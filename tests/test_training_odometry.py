@@ -182,6 +182,20 @@ def test_pairs_show_the_same_points_and_repeat_for_the_same_seed(store: Path) ->
     assert not np.array_equal(batch["images"], pairs[4]["images"])
 
 
+@pytest.mark.parametrize("processes", [2, 3])
+def test_processes_together_make_the_batch_of_one(store: Path, processes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames, settings = [frames_of(store, LandmarkSettings())], settings_of()
+    whole = TrackedPairs(frames, settings)[1]
+    size = settings.optimiser.batch_size
+    monkeypatch.setenv("WORLD_SIZE", str(processes))
+    for rank in range(processes):
+        monkeypatch.setenv("RANK", str(rank))
+        part, own = TrackedPairs(frames, settings)[1], list(range(rank, size, processes))
+        for name, values in part.items():
+            rows = own if len(whole[name]) == size else [*own, *(size + number for number in own)]
+            np.testing.assert_array_equal(values, whole[name][rows], err_msg=name)
+
+
 def test_the_detector_ignores_what_is_unknown(store: Path) -> None:
     pairs = TrackedPairs([frames_of(store, PAPER)], settings_of())
     values = np.concatenate([pairs[step]["cells"].ravel() for step in range(4)])

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from improvo import config
+from improvo.cli.main import main
 from improvo.errors import ConfigError
 from improvo.training import settings as training_settings
 from improvo.training.held_settings import DevicePairSettings, HeldSettings
@@ -93,6 +94,16 @@ def test_defaults_are_good_and_every_group_is_checked(stage: type) -> None:
     for group in vars(training_settings).values():
         if dataclasses.is_dataclass(group) and group.__module__ == training_settings.__name__:
             assert "__post_init__" in vars(group), group
+
+
+def test_a_stage_has_no_section_that_does_nothing_in_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["config", "train-shapes"]) == 0
+    assert "adaptation" not in capsys.readouterr().out
+    assert main(["config", "train-homographies"]) == 0
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    for name, comment in (("accepted", "is a label"), ("undecided", "is neither label nor background")):
+        (row,) = (number for number, line in enumerate(lines) if line.startswith(f"{name}:"))
+        assert comment in " ".join(lines[row - 1 : row + 1])
 
 
 def test_a_setting_of_a_section_is_named_once() -> None:

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import difflib
 import functools
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,6 +16,7 @@ from improvo.untrusted.paths import check_path
 from improvo.untrusted.text import load_yaml, reason
 
 T = TypeVar("T")
+SEEDS = 2**32  # so many there are: what all generators of random numbers take
 _LONGEST_VALUE = 60  # characters of a value in a message
 
 # Settings that were renamed: the section, what a setting there was called, and what it is called now. Files that were
@@ -136,12 +138,30 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings", bas
         # a section given in part keeps what this class has for the rest of it, not the section's own defaults
         values = over(to_dict(base), values)
     try:
-        return _converter().structure(values, cls)
+        settings: T = _converter().structure(values, cls)
+        _check_numbers(settings)
+        return settings
     except ClassValidationError as error:
         first = _first_reason(error)
         raise ConfigError(first if first.startswith("--") else f"{where}: {first}") from None
     except (TypeError, ValueError, OverflowError, AttributeError, LookupError) as error:
         raise ConfigError(f"{where}: {reason(error)}") from None
+
+
+def _check_numbers(settings: Any, prefix: str = "") -> None:
+    """Refuse, in all sections, numbers that none of them can mean.
+
+    Raises:
+        ValueError: infinite, no number, or a seed that a generator of random numbers does not take.
+    """
+    for each in dataclasses.fields(settings):
+        name, value = f"{prefix}{each.name}", getattr(settings, each.name)
+        if dataclasses.is_dataclass(value):
+            _check_numbers(value, f"{name}.")
+        elif isinstance(value, float) and not math.isfinite(value):
+            raise ValueError(f"setting `{name}`: {value} is no finite number")
+        elif each.name == "seed" and isinstance(value, int) and not 0 <= value < SEEDS:
+            raise ValueError(f"setting `{name}`: {value} must be 0 or more, and less than {SEEDS}")
 
 
 def with_present_names(values: Any, section: str = "") -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +25,21 @@ class SettingsRecord:
         kind: class of the settings, if they have one. A setting that the file lacks, because it came with a later
             version, counts as having its default.
         free: dotted names of settings that may differ, because no result depends on them.
+        contents: dotted names of settings that name files, each with the entry that says what is in these. Where the
+            record has the entry, only that is compared; a record of an earlier version has none.
     """
 
-    def __init__(self, path: Path, kind: type | None = None, free: Iterable[str] = ()) -> None:
+    def __init__(
+        self,
+        path: Path,
+        kind: type | None = None,
+        free: Iterable[str] = (),
+        contents: Mapping[str, str] | None = None,
+    ) -> None:
         self.path = path
         self._defaults = config.to_dict(kind()) if kind else {}
         self._section = config.section_of(kind) if kind else ""
-        self._free = tuple(free)
+        self._free, self._contents = tuple(free), dict(contents or {})
 
     def read(self) -> Any:
         """The recorded settings under their present names; None where there is no record.
@@ -57,7 +65,9 @@ class SettingsRecord:
             return ""
         if isinstance(before, dict) and isinstance(settings, dict):
             before = config.over(self._defaults, before)
-        return first_difference(self._fixed(before), self._fixed(settings))
+        known = before.keys() if isinstance(before, dict) else ()
+        free = [name if entry in known else entry for name, entry in self._contents.items()]
+        return first_difference(self._fixed(before, free), self._fixed(settings, free))
 
     def check(self, settings: Any, mend: str) -> None:
         """Refuse to go on under other settings.
@@ -83,10 +93,10 @@ class SettingsRecord:
         else:
             write_text(self.path, yaml.safe_dump(settings, sort_keys=False))
 
-    def _fixed(self, settings: Any) -> Any:
+    def _fixed(self, settings: Any, free: Iterable[str]) -> Any:
         """A copy without the settings that may differ."""
         fixed = copy.deepcopy(settings)
-        for name in self._free:
+        for name in (*self._free, *free):
             *sections, leaf = name.split(".")
             section = fixed
             for part in sections:

@@ -91,15 +91,18 @@ def clear_leftovers(folder: Path) -> None:
     """Remove what killed processes left half-written in a folder of ours, and below it."""
     for place, folders, names in os.walk(folder):
         for name in [*names, *folders]:
-            match = _TEMPORARY.fullmatch(name)
-            leftover = Path(place) / name
-            if match is None or is_being_written(leftover):
-                continue
-            if leftover.is_dir() and not leftover.is_symlink():
-                shutil.rmtree(leftover, ignore_errors=True)
-            else:
-                with suppress(OSError):
-                    leftover.unlink(missing_ok=True)
+            _remove_leftover(Path(place) / name)
+
+
+def _remove_leftover(path: Path) -> None:
+    """Remove a temporary file or folder, unless its process may still write it."""
+    if _TEMPORARY.fullmatch(path.name) is None or is_being_written(path):
+        return
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 def is_being_written(path: Path) -> bool:
@@ -190,7 +193,7 @@ def check_output_folder(path: Path, command: str) -> None:
 
 
 def check_output_file(path: Path, suffixes: Collection[str] = ()) -> None:
-    """Refuse a file that cannot be written, before any work is done.
+    """Refuse a file that cannot be written, before any work is done; clear what killed processes left beside it.
 
     Args:
         path: of the file.
@@ -210,6 +213,9 @@ def check_output_file(path: Path, suffixes: Collection[str] = ()) -> None:
         raise OutputError(f"{path}: {existing} is a file, not a folder; choose another folder")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise OutputError(f"{path}: no permission to write in {existing}; choose another folder")
+    if path.parent.is_dir():
+        for beside in path.parent.glob(".*.partial*"):  # the folder is the user's, and may be large: nothing below it
+            _remove_leftover(beside)
 
 
 def _check_name(path: Path) -> None:

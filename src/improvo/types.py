@@ -104,7 +104,7 @@ class Trajectory:
 class SparseMap:
     """3D points of a finished run (paper, "Optimization Variables")."""
 
-    ids: Int64  # (P,) point id
+    ids: Int64  # (P,) point id, each once; all -1 where a file does not tell
     xyz: Float64  # (P, 3) world
     observations: Int64  # (P,) number of images that the point was observed in
     mean_error: Float64  # (P,) pixels
@@ -114,3 +114,10 @@ class SparseMap:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def rows_of(self, ids: Int64) -> Int64:
+        """(N,) the row of each point id (N,); -1 for what is no point of this map."""
+        order = np.argsort(self.ids)
+        place = np.searchsorted(self.ids, ids, sorter=order)
+        row = np.append(order, -1)[place]
+        return np.where((ids >= 0) & (row >= 0) & (np.append(self.ids, -1)[row] == ids), row, -1)

@@ -321,25 +321,28 @@ def evaluate_trajectory(
 
     Args:
         estimate: poses, a trajectory file, or the output folder of a run.
-        truth: poses, a trajectory file, or a sequence that has true poses.
+        truth: poses, a trajectory file, the output folder of a run, or a sequence that has true poses; it needs no
+            calibration.
         settings: alignment and the lengths of sub-trajectories.
 
-    Raises:
-        InputError: a file that is no trajectory, a sequence without true poses, or no common time.
-    """
-    from improvo.errors import InputError
-    from improvo.evaluation.settings import TrajectorySettings
-    from improvo.evaluation.trajectory.protocol import evaluate_trajectory as errors_of
-    from improvo.geometry.trajectory_files import read_trajectory
-    from improvo.sequences import open_sequence
+    Rows of a KITTI file without times are taken as the rows of the other, one by one.
 
-    if isinstance(estimate, str | Path):
-        path = Path(estimate)
-        estimate = read_trajectory(path / "trajectory.txt" if path.is_dir() else path)
-    if isinstance(truth, str | Path):
-        path = Path(truth)
-        found = open_sequence(path).ground_truth if path.is_dir() else read_trajectory(path)
-        if found is None:
-            raise InputError(f"{path}: has no true poses; give a trajectory file or a sequence that has them")
-        truth = found
-    return errors_of(estimate, truth, settings or TrajectorySettings())
+    Raises:
+        InputError: a file that is no trajectory, a sequence without true poses, rows without times of which the
+            other has another number, or no common time.
+    """
+    from improvo.evaluation.settings import TrajectorySettings
+    from improvo.evaluation.trajectory.pair import read_pair
+    from improvo.evaluation.trajectory.protocol import evaluate_trajectory as errors_of
+
+    ours, true, _ = read_pair(_poses_or_path(estimate), _poses_or_path(truth))
+    names = (_name_of(estimate, "the estimate"), _name_of(truth, "the truth"))
+    return errors_of(ours, true, settings or TrajectorySettings(), names)
+
+
+def _poses_or_path(given: Trajectory | PathLike) -> Trajectory | Path:
+    return Path(given) if isinstance(given, str | Path) else given
+
+
+def _name_of(given: Trajectory | PathLike, otherwise: str) -> str:
+    return str(given) if isinstance(given, str | Path) else otherwise

@@ -77,6 +77,5 @@ class BundleResult:
     cost: float  # the objective Omega at the end
     initial_cost: float
     iterations: int  # steps tried
-    rejected: int  # of them, steps that were taken back
     converged: bool  # stopped because steps no longer changed the cost, not by the iteration limit
     seconds: dict[str, float] = field(default_factory=dict)  # per part, where asked for

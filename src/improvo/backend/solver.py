@@ -48,7 +48,7 @@ def solve(
         cost = initial_cost = evaluate(constants, observations, poses, points)
 
     damping, growth = settings.initial_damping, 2.0
-    iterations = rejected = 0
+    iterations = 0
     must_linearise, converged = True, cost == 0.0
     while iterations < settings.max_iterations and not converged and damping <= settings.max_damping:
         iterations += 1
@@ -77,13 +77,12 @@ def solve(
             damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), settings.min_damping)
             growth = 2.0
         else:
-            rejected += 1
             damping, growth = damping * growth, growth * 2.0
 
     converged = converged or damping > settings.max_damping
     errors, depths = errors_and_depths(constants, observations, poses, points)
     return BundleResult(
-        poses, points, errors, depths, float(cost), float(initial_cost), iterations, rejected, converged, clock.seconds
+        poses, points, errors, depths, float(cost), float(initial_cost), iterations, converged, clock.seconds
     )
 
 

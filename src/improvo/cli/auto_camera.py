@@ -22,7 +22,8 @@ def with_found_camera(settings: T, recordings: Sequence[Path], folder: Path | No
     Args:
         settings: with a section `sequence`; returned as they are where another camera is given.
         recordings: paths.
-        folder: of the command's output, where the cameras are left; None is the user's cache.
+        folder: of the command's output, where the cameras are left; None is the user's cache, where later commands
+            on the same recordings find them too.
         command: that the folder belongs to.
 
     Raises:
@@ -40,14 +41,15 @@ def with_found_camera(settings: T, recordings: Sequence[Path], folder: Path | No
     from improvo.self_calibration.found_cameras import find_cameras
     from improvo.terminal import stages
 
-    kept = _kept(recordings) if folder is None else folder
+    cache = _cache_of(recordings)
+    kept = _made(cache) if folder is None else folder
     new = folder is not None and not folder.exists()
     if folder is not None:
         make_output_folder(folder, command)
     compile_odometry(notice)
     try:
         with stages("step") as told:
-            found = find_cameras(recordings, sequence, kept, told=told, on_found=_say)
+            found = find_cameras(recordings, sequence, kept, told=told, on_found=_say, before=cache)
     except InputError:
         if new:
             remove_unused_folder(kept)
@@ -74,15 +76,19 @@ def _say(path: Path, found: CameraFromMotion | InputError | None) -> None:
         notice(f"no camera: {found}")
 
 
-def _kept(recordings: Sequence[Path]) -> Path:
-    """A folder of the user's cache for the cameras of these recordings."""
+def _cache_of(recordings: Sequence[Path]) -> Path:
+    """The folder of the user's cache for the cameras of these recordings; it need not be there."""
     import hashlib
 
     from improvo.cli.main import cache_folder
-    from improvo.errors import OutputError
 
     names = "\n".join(str(path.absolute()) for path in recordings)
-    folder = cache_folder() / "cameras" / hashlib.sha256(names.encode("utf-8", "surrogateescape")).hexdigest()[:16]
+    return cache_folder() / "cameras" / hashlib.sha256(names.encode("utf-8", "surrogateescape")).hexdigest()[:16]
+
+
+def _made(folder: Path) -> Path:
+    from improvo.errors import OutputError
+
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

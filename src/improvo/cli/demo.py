@@ -14,6 +14,7 @@ from improvo.cli.output import next_step, say, typed
 from improvo.errors import PLOTS_MISSING, ImprovoError, installed, plots_installed
 
 _STEPS = 300
+_INTERRUPTED = 130  # exit status
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,8 +28,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, default=_STEPS, help="of training")
 
 
+class _InterruptedError(Exception):
+    """One of the commands was interrupted, and has said so."""
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Run, compare with the truth, draw, improve, and run again; prints each command before it runs."""
+    try:
+        return _run(arguments)
+    except _InterruptedError:
+        return _INTERRUPTED
+
+
+def _run(arguments: argparse.Namespace) -> int:
     from improvo.files import make_output_folder
     from improvo.simulation import bundled_sequence
 
@@ -69,10 +81,13 @@ def _do(words: list[str]) -> None:
 
     Raises:
         ImprovoError: it failed; its own message is printed already.
+        _InterruptedError: it was interrupted.
     """
     from improvo.cli.main import main
 
     say(f"\n$ improvo {shlex.join(words)}")
     status = main(words)
+    if status == _INTERRUPTED:
+        raise _InterruptedError
     if status:
         raise ImprovoError(f"the demo stopped: `improvo {words[0]}` ended with status {status}")

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from improvo.errors import ConfigError, MissingExtraError
+from improvo.evaluation.settings import PEERS
 
 if TYPE_CHECKING:
     from improvo.evaluation.sources import FeatureSource, LoadedFrontend, Recorded
     from improvo.sequences.base import SequenceSettings
 
-DEFAULT_FRONTENDS = ["sift", "orb", "akaze"]
+DEFAULT_FRONTENDS = ("sift", "orb", "akaze")
 
 
 def available_cores() -> int:
@@ -21,14 +23,27 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def add_frontend_arguments(parser: argparse.ArgumentParser, max_keypoints: int) -> None:
-    """Which frontends, and how many keypoints (the default is given for the help only)."""
+def add_frontend_arguments(
+    parser: argparse.ArgumentParser,
+    max_keypoints: int,
+    default: Sequence[str] = DEFAULT_FRONTENDS,
+    peers: bool = True,
+) -> None:
+    """Which frontends, and how many keypoints (the defaults are given for the help only).
+
+    Args:
+        parser: of the command.
+        max_keypoints: where none are given.
+        default: frontends where none is given.
+        peers: whether other people's networks can be asked for.
+    """
+    others = f", a peer ({', '.join(PEERS)})" if peers else ""
     parser.add_argument(
         "--frontend",
         action="append",
         metavar="NAME",
-        help="sift, orb, akaze, surf, superpoint-vo, ..., a .safetensors file, a peer (xfeat, aliked, disk), or `all` "
-        f"that can run; LABEL=NAME names its row; repeatable (default: {', '.join(DEFAULT_FRONTENDS)})",
+        help=f"sift, orb, akaze, surf, superpoint-vo, ..., a .safetensors file{others}, or `all` that can run; "
+        f"LABEL=NAME names its row; repeatable (default: {', '.join(default)})",
     )
     parser.add_argument(
         "--max-keypoints",
@@ -74,14 +89,15 @@ def recorded_sequences(arguments: argparse.Namespace, settings: SequenceSettings
 
 
 def loaded_frontends(
-    asked: list[str] | None, max_keypoints: int, default: list[str] | None = None
+    asked: list[str] | None, max_keypoints: int, default: Sequence[str] = DEFAULT_FRONTENDS, peers: bool = True
 ) -> tuple[list[LoadedFrontend], list[dict[str, str]]]:
     """The frontends of the command line, each loaded once so that a wrong name fails before any work.
 
     Args:
         asked: `--frontend` of the command line.
         max_keypoints: per image.
-        default: names where none is asked for; None are the usual ones.
+        default: names where none is asked for.
+        peers: whether other people's networks are among them.
 
     Returns:
         The frontends, and those of `all` that cannot run here, with the reason.
@@ -89,18 +105,21 @@ def loaded_frontends(
     Raises:
         ConfigError, InputError: an unknown name. MissingExtraError: one that was named cannot run here.
     """
-    from improvo.evaluation.sources import PEERS, LoadedFrontend
+    from improvo.evaluation.sources import LoadedFrontend
     from improvo.frontend.registry import CLASSICAL
     from improvo.frontend.weights import bundled_names
 
-    asked = asked or (DEFAULT_FRONTENDS if default is None else default)
+    asked = asked or list(default)
     named = [name for name in asked if name != "all"]
-    optional = [name for name in (*CLASSICAL, *bundled_names(), *PEERS) if name not in named] if "all" in asked else []
+    known = (*CLASSICAL, *bundled_names(), *(PEERS if peers else ()))
+    optional = [name for name in known if name not in named] if "all" in asked else []
     found: list[LoadedFrontend] = []
     skipped: list[dict[str, str]] = []
     for text in (*named, *optional):
         label, name = split_label(text)
         source = LoadedFrontend(name, max_keypoints, label)
+        if name in PEERS and not peers:
+            raise ConfigError(f"--frontend {name}: odometry has only our own frontends; `evaluate pose` compares peers")
         try:
             source.check()
         except MissingExtraError as error:

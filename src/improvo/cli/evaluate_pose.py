@@ -142,7 +142,7 @@ def read_results(path: Path) -> dict[str, Any]:
 
 def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     from improvo import __version__
-    from improvo.cli.evaluate_options import exported_features, loaded_frontends
+    from improvo.cli.evaluate_options import DEFAULT_FRONTENDS, exported_features, loaded_frontends
     from improvo.evaluation.pose.results import results, write_records
     from improvo.evaluation.pose.run import run_pose_protocol
     from improvo.files import check_output_folder, make_output_folder, write_json
@@ -152,7 +152,7 @@ def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     output: Path | None = arguments.output
     if output is not None:
         check_output_folder(output, COMMAND)
-    default: list[str] | None = [] if arguments.features else None
+    default = () if arguments.features else DEFAULT_FRONTENDS
     loaded, skipped = loaded_frontends(arguments.frontend, settings.max_keypoints, default)
     exported = exported_features(arguments.features, settings.max_keypoints, one_sequence=len(sources) == 1)
     frontends = [*loaded, *exported]

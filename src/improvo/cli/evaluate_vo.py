@@ -20,6 +20,7 @@ from improvo.cli.output import figures, next_after_figures
 from improvo.evaluation.settings import VoCommandSettings
 
 COMMAND = "evaluate vo"
+_DEFAULT = ("superpoint-vo",)
 _FLAGS = {
     **TRAJECTORY_FLAGS,
     "max_keypoints": "max_keypoints",
@@ -33,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     defaults = VoCommandSettings()
     parser.add_argument("sequences", nargs="+", type=recording_path, metavar="SEQUENCE", help="with true poses")
     add_truth_argument(parser)
-    add_frontend_arguments(parser, defaults.max_keypoints)
+    add_frontend_arguments(parser, defaults.max_keypoints, _DEFAULT, peers=False)
     parser.add_argument(
         "--mode",
         choices=("robust", "paper"),
@@ -51,6 +52,7 @@ def run(arguments: argparse.Namespace) -> int | None:
     from improvo import __version__
     from improvo.cli.evaluate_options import loaded_frontends, recorded_sequences
     from improvo.config import to_dict
+    from improvo.evaluation.sources import file_name
     from improvo.evaluation.trajectory.tables import vo_tables
     from improvo.evaluation.vo.protocol import evaluate_vo
     from improvo.files import check_output_folder, make_output_folder, write_json, write_text
@@ -62,24 +64,23 @@ def run(arguments: argparse.Namespace) -> int | None:
     if output is not None:
         check_output_folder(output, COMMAND)
     settings = with_found_camera(settings, arguments.sequences, output, COMMAND)
-    frontends, _ = loaded_frontends(arguments.frontend, settings.max_keypoints, ["superpoint-vo"])
+    frontends, skipped = loaded_frontends(arguments.frontend, settings.max_keypoints, _DEFAULT, peers=False)
     sources = recorded_sequences(arguments, settings.sequence)
     with Workers(arguments.workers, progress=True) as workers:
-        outcomes, found = evaluate_vo(
-            sources,
-            [frontend.name for frontend in frontends],
-            settings.max_keypoints,
-            settings.odometry,
-            settings.trajectory,
-            workers,
-        )
-    results = {"protocol": "vo", "improvo": __version__, "settings": to_dict(settings), **found}
+        outcomes, found = evaluate_vo(sources, frontends, settings.odometry, settings.trajectory, workers)
+    results = {
+        "protocol": "vo",
+        "improvo": __version__,
+        "settings": to_dict(settings),
+        **found,
+        "skipped_frontends": skipped,
+    }
     text = vo_tables(results)
     figures(results, text)
     if output is not None:
         make_output_folder(output, COMMAND)
         for outcome in outcomes:
-            folder = output / f"{outcome.frontend}{outcome.variant}"
+            folder = output / f"{file_name(outcome.frontend)}{outcome.variant}"
             folder.mkdir(exist_ok=True)
             write_trajectory(folder / f"{outcome.sequence}.txt", outcome.trajectory)
         write_json(output / "vo.json", results)

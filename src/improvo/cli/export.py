@@ -10,6 +10,7 @@ from improvo.cli.flags import add_setting
 from improvo.cli.output import figures, next_step, say, typed
 from improvo.cli.show_options import add_recording, add_run_folder, target_path
 from improvo.errors import OutputError
+from improvo.files import check_output_file
 
 if TYPE_CHECKING:
     from improvo.export.model import Model
@@ -98,7 +99,7 @@ def run_trajectory(arguments: argparse.Namespace) -> None:
     from improvo.odometry.run_folder import RunFolder
 
     run_folder = RunFolder(arguments.folder)
-    target = target_path(arguments.output, arguments.output, _FILE_NAMES[arguments.format])
+    target = target_path(arguments.output, arguments.output, _FILE_NAMES[arguments.format], (".txt", ".csv"))
     export_trajectory(run_folder.trajectory, run_folder.frames, target, arguments.format)
     say(f"{target}: {len(run_folder.trajectory)} poses, camera-to-world, in map units")
     next_step(f"`improvo evaluate trajectory {typed(target)} TRUTH` measures them")
@@ -127,6 +128,7 @@ def run_onnx(arguments: argparse.Namespace) -> None:
     given = {name: getattr(arguments, name) for name in _ONNX_SETTINGS if hasattr(arguments, name)}
     # the move to corners works on the image beside the network, and is no part of the file
     settings = NetworkSettings(**given, corner_radius=0)
+    check_output_file(arguments.output, (".onnx",))
     if not arguments.output.parent.is_dir():
         raise OutputError(f"{arguments.output}: no folder {arguments.output.parent}; make it first")
     export_onnx(load_weights(find_weights(arguments.weights)), arguments.output, settings, arguments.layout)

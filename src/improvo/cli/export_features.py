@@ -10,6 +10,7 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
+from improvo.cli.auto_camera import with_found_camera
 from improvo.cli.flags import add_setting
 from improvo.cli.options import (
     add_config_arguments,
@@ -58,6 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_output_folder(folder, "export features")
     for_hloc = arguments.layout == "hloc"
     check_h5py() if for_hloc else load_pycolmap()
+    settings = with_found_camera(settings, [arguments.sequence], folder, "export features")
     sequence = open_sequence(arguments.sequence, settings.sequence)
     if sequence.length is None:
         raise InputError(f"{sequence.path}: is live; record it first")

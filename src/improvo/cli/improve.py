@@ -157,11 +157,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _plan(arguments: argparse.Namespace, settings: ImproveSettings) -> int:
-    """Measure a sample; nothing is left."""
+    """Measure a sample; nothing is left but cameras that were looked for, in the user's cache."""
     from improvo.improvement.plan import plan_improvement
     from improvo.odometry.compile import compile_odometry
     from improvo.terminal import progress
 
+    settings = with_found_camera(settings, [*arguments.sequences, *arguments.evaluate], None, "improve")
     compile_odometry(notice)
     with progress("sample", "frame") as shown:
         plan = plan_improvement(

@@ -134,11 +134,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _plan(arguments: argparse.Namespace, settings: LabelRunSettings) -> int:
-    """Measure a sample; nothing is left."""
+    """Measure a sample; nothing is left but cameras that were looked for, in the user's cache."""
     from improvo.labeling.plan import plan_labels
     from improvo.odometry.compile import compile_odometry
     from improvo.terminal import progress
 
+    settings = with_found_camera(settings, arguments.sequences, None, "label")
     compile_odometry(notice)
     with progress("sample", "frame") as shown:
         plan = plan_labels(arguments.sequences, settings, arguments.pack, shown.advance)

@@ -79,18 +79,32 @@ def main(argv: Sequence[str] | None = None) -> int:
         locations.close(success=False)
         return 2
     except KeyboardInterrupt:
-        locations.close(success=False)
-        print("improvo: interrupted", file=sys.stderr)
-        return 130
+        return _interrupted()
     except BrokenPipeError:  # of a command whose result is what it prints
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
+        if _came_of_an_interrupt(error):
+            return _interrupted()
         said = _limit_of_the_machine(error)
         if not said:
             raise
         print(f"improvo: {said}", file=sys.stderr)
         return 2
+
+
+def _interrupted() -> int:
+    """Say so; returns the exit status."""
+    locations.close(success=False)
+    print("improvo: interrupted", file=sys.stderr)
+    return 130
+
+
+def _came_of_an_interrupt(error: BaseException | None) -> bool:
+    """Whether an interrupt came in the middle of compiled code, which makes an error of another kind of it."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__ if isinstance(error, SystemError) else None
+    return error is not None
 
 
 def _make_streams_usable() -> None:

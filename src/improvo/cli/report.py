@@ -24,7 +24,7 @@ def run(arguments: argparse.Namespace) -> None:
     from improvo.report.pages import write_report
     from improvo.report.palettes import palette
 
-    target = target_path(arguments.output, arguments.folder, "report.html")
+    target = target_path(arguments.output, arguments.folder, "report.html", (".html", ".htm"))
     write_report(arguments.folder, target, palette(arguments.palette), arguments.sequence)
     say(str(target))
     next_step("open it in a browser; it is one file, to send on as it is")

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from improvo.labeling.labeler import LabeledRun
     from improvo.odometry.scale.sources import Ask
     from improvo.odometry.visual_odometry import TrackedFrame
-    from improvo.odometry.visualizer import Visualizer
+    from improvo.report.rerun_viewer import RerunViewer
     from improvo.sequences import Sequence
 
 NO_RESULT = 3  # exit status where everything was read, and no frame has a pose
@@ -105,7 +105,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _tracked(arguments: argparse.Namespace, sequence: Sequence, settings: DenseRunSettings, ask: Ask | None) -> int:
     """Everything that is written; 130 after an interrupt."""
-    summary = _track(sequence, arguments.output, settings, _viewer(arguments))
+    viewer = _viewer(arguments)
+    summary = _track(sequence, arguments.output, settings, viewer)
     if ask is not None:
         summary = _in_metres(sequence, summary, ask, settings)
     figures(_figures(summary), "")
@@ -125,12 +126,14 @@ def _tracked(arguments: argparse.Namespace, sequence: Sequence, settings: DenseR
         )
     else:
         next_step(f"`improvo info {recording_words(arguments.sequence)}` looks for what is wrong with the recording")
+    if viewer is not None and viewer.failure is not None:
+        raise viewer.failure
     if interrupted:
         return 130
     return 0 if summary.tracked else NO_RESULT
 
 
-def _viewer(arguments: argparse.Namespace) -> Visualizer | None:
+def _viewer(arguments: argparse.Namespace) -> RerunViewer | None:
     """Rerun where somebody wants to look."""
     if not arguments.view and arguments.save is None:
         return None
@@ -160,7 +163,7 @@ def _in_metres(sequence: Sequence, summary: LabeledRun, ask: Ask, settings: Dens
         raise InputError(f"{error}; {summary.folder} holds the run, up to scale") from None
 
 
-def _track(sequence: Sequence, folder: Path, settings: DenseRunSettings, viewer: Visualizer | None) -> LabeledRun:
+def _track(sequence: Sequence, folder: Path, settings: DenseRunSettings, viewer: RerunViewer | None) -> LabeledRun:
     """The run with its progress."""
     from improvo.labeling.labeler import run_and_label
     from improvo.odometry.compile import compile_odometry

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from improvo.cli.output import say
 from improvo.errors import ConfigError, OutputError
+from improvo.files import check_output_file
 from improvo.terminal import counted
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 _EVENLY = "6"  # frames of a sheet
 _MANY = 20  # frames that deserve a progress bar
 _LARGEST_SHEET = 60  # frames; more become files of their own
+_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 MOVING = (".mp4", ".webm", ".gif", ".webp")  # suffixes of `improvo.report.sheets`, which loads more
 
 
@@ -108,13 +110,20 @@ def chosen_frames(which: str, count: int, flag: str = "--frames") -> list[int]:
     return [round((i + 0.5) * count / spread - 0.5) for i in range(spread)]  # the middles of equal parts
 
 
-def target_path(output: Path | None, default_folder: Path, name: str) -> Path:
-    """Where a picture goes: `output` as a file or folder, else `default_folder`. Nothing is made yet.
+def target_path(
+    output: Path | None, default_folder: Path, name: str, suffixes: Collection[str] = (*_PICTURES, *MOVING)
+) -> Path:
+    """Where a picture or page goes: `output` as a file or folder, else `default_folder`. Nothing is made yet.
+
+    Args:
+        output, default_folder, name: as above; the name in a folder.
+        suffixes: of such files; one that exists under another is not replaced.
 
     Raises:
         OutputError: it cannot be there.
     """
-    if output is not None and output.suffix:
+    if output is not None and output.suffix and not output.is_dir():
+        check_output_file(output, suffixes)
         if not output.parent.is_dir():
             raise OutputError(f"{output}: no folder {output.parent}; make it first")
         return output

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from improvo.cli.output import next_step, say, typed
 from improvo.errors import InputError, OutputError
+from improvo.files import check_output_file
 from improvo.types import UInt8
 
 _CONSUMERS = {
@@ -170,6 +171,7 @@ def _checked_output(path: Path) -> Path:
 
 
 def _check_new(path: Path) -> None:
+    check_output_file(path)
     if path.exists() or path.with_suffix(".json").exists():
         raise OutputError(f"{path}: it or its .json exists already; choose another file with -o")
     if not path.parent.is_dir():

@@ -30,7 +30,7 @@ def agreed_depth(
     """
     agreeing = np.zeros(depth_map.depth.shape, np.uint8)
     contradicting = np.zeros_like(agreeing)
-    mean = np.zeros_like(depth_map.depth)
+    mean = depth_map.depth.copy()  # where nobody is asked, a depth stays as it is
     if others:
         K = depth_map.K
         compare(

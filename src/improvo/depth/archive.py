@@ -1,8 +1,9 @@
 """`depth.zip`: the depth maps of a run in one file.
 
-A stored zip of 16-bit PNGs, `000123.png` for frame_index 123, and `depth.json` with their scale and camera. Any tool
-reads them once unzipped: depth = value / scale, 0 is unknown. Depths are Z in the camera, in the unit of the run (the
-first median depth of its segment is 1).
+A stored zip of 16-bit PNGs, `000123.png` for frame_index 123, and `depth.json` with their scales, unit and camera. Any
+tool reads them once unzipped: depth = value / the scale of that frame, 0 is unknown. Depths are Z in the camera, in the
+unit of the run. Each map has a scale of its own, so that one frame with a far view does not cost the others precision.
+Files from before that have one `scale` for all maps, and are read too.
 """
 
 from __future__ import annotations
@@ -29,23 +30,25 @@ from improvo.untrusted.text import load_json, reason
 DEPTH_FILE = "depth.zip"
 _ABOUT = "depth.json"
 _LARGEST = 65535
+_NEAR = 0.01  # this share of a map's depths is nearer than its near depth
+_SPAN = 327.0  # farthest depth that is kept, by the near depth, which so has steps of half a per cent
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the same maps give the same bytes
 
 
 class DepthWriter:
-    """`with DepthWriter(path, K, size, farthest) as maps: maps.write(frame, depth)`: the file appears at the end.
+    """`with DepthWriter(path, K) as maps: maps.write(frame, depth)`: the file appears at the end.
 
     Args:
         path: of the file.
         K: (3, 3) of the maps.
-        farthest: depth that the largest value stands for; farther pixels become unknown.
+        unit: of the depths, for a person.
     """
 
-    def __init__(self, path: Path, K: Float64, farthest: float) -> None:
+    def __init__(self, path: Path, K: Float64, unit: str = "up to scale") -> None:
         self._atomic: AbstractContextManager[Path] = written_atomically(path)
-        self._K = K
-        self.scale = _LARGEST / farthest
+        self._K, self._unit = K, unit
         self._frames: list[int] = []
+        self._scales: list[float] = []
 
     def __enter__(self) -> DepthWriter:
         self._file = zipfile.ZipFile(self._atomic.__enter__(), "w")
@@ -57,11 +60,11 @@ class DepthWriter:
         try:
             if kind is None:
                 about = {
-                    "unit": "that of the run: the first median depth is 1",
-                    "depth": "value / scale, 0 where unknown; Z in the camera",
-                    "scale": self.scale,
+                    "unit": self._unit,
+                    "depth": "value / scale of the frame, 0 where unknown; Z in the camera",
                     "K": self._K.tolist(),
                     "frames": self._frames,
+                    "scales": self._scales,  # of each of the frames
                 }
                 self._store(_ABOUT, (json.dumps(about, indent=2) + "\n").encode())
             self._file.close()
@@ -71,14 +74,24 @@ class DepthWriter:
         self._atomic.__exit__(kind, error, trace)
 
     def write(self, frame_index: int, depth: Float32) -> None:
-        """Add the map of a frame, (h, w) with 0 where unknown."""
-        values = np.rint(depth.astype(np.float64) * self.scale)
+        """Add the map of a frame, (h, w) with 0 where unknown; what is 327 times as far as its near part is lost."""
+        scale = _scale_of(depth)
+        values = np.rint(depth.astype(np.float64) * scale)
         values = np.where((values >= 1) & (values <= _LARGEST), values, 0).astype(np.uint16)
         self._store(f"{frame_index:06d}.png", cv2.imencode(".png", values)[1].tobytes())
         self._frames.append(frame_index)
+        self._scales.append(scale)
 
     def _store(self, name: str, content: bytes) -> None:
         self._file.writestr(zipfile.ZipInfo(name, _EPOCH), content)
+
+
+def _scale_of(depth: Float32) -> float:
+    """Values per unit of depth of a map."""
+    known = depth[depth > 0].astype(np.float64)
+    if len(known) == 0:
+        return 1.0
+    return float(_LARGEST / min(known.max(), _SPAN * np.quantile(known, _NEAR)))
 
 
 class DepthReader:
@@ -96,9 +109,10 @@ class DepthReader:
         about = self._about
         try:
             self.frames: list[int] = [int(frame) for frame in about["frames"]]  # frame_index of each map
-            self.scale = float(about["scale"])  # values per unit of depth
             self.K: Float64 = np.array(about["K"], np.float64).reshape(3, 3)  # of the maps
-            if not (0 < self.scale < float("inf") and np.isfinite(self.K).all()):
+            scales = about["scales"] if "scales" in about else [about["scale"]] * len(self.frames)
+            self.scales = {frame: float(scale) for frame, scale in zip(self.frames, scales, strict=True)}
+            if not (all(0 < scale < float("inf") for scale in self.scales.values()) and np.isfinite(self.K).all()):
                 raise ValueError("numbers that cannot be")
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise self._damaged(error) from None
@@ -117,7 +131,7 @@ class DepthReader:
         Raises:
             InputError: there is no map of this frame, or it is damaged.
         """
-        if frame_index not in self.frames:
+        if frame_index not in self.scales:
             raise InputError(f"{self.path}: has no depth of frame {frame_index}")
         try:
             values = decode(self._read(f"{frame_index:06d}.png"), cv2.IMREAD_UNCHANGED)
@@ -125,7 +139,7 @@ class DepthReader:
             raise self._damaged(f"frame {frame_index}: {error}") from None
         if values.dtype != np.uint16 or values.ndim != 2:
             raise self._damaged(f"frame {frame_index} is no 16-bit PNG")
-        return (values / self.scale).astype(np.float32)
+        return (values / self.scales[frame_index]).astype(np.float32)
 
     def _read(self, name: str) -> bytes:
         try:

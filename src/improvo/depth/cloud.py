@@ -16,10 +16,15 @@ _MERGE_EVERY = 16  # maps
 
 
 class DenseCloud:
-    """Collects the agreed pixels of depth maps; the points of a cell become their mean, with the mean colour."""
+    """Collects the agreed pixels of depth maps; the points of a cell become their mean, with the mean colour.
 
-    def __init__(self, settings: CloudSettings) -> None:
-        self._settings = settings
+    Args:
+        settings: the size of a cell and the rules.
+        unit: what the first median depth of the run is in the unit of the poses: 1, or metres per unit of the odometry.
+    """
+
+    def __init__(self, settings: CloudSettings, unit: float = 1.0) -> None:
+        self._settings, self._cell = settings, settings.voxel * unit
         self._keys: Int64 = np.zeros(0, np.int64)
         self._sums: Float64 = np.zeros((0, 7))  # x, y, z, red, green, blue, count
         self._pending: list[tuple[Int64, Float64]] = []
@@ -42,7 +47,7 @@ class DenseCloud:
         points = (rays * depth_map.depth[rows, columns]).T @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
         colours = picture[rows, columns].astype(np.float64)
         colours = np.repeat(colours[:, None], 3, axis=1) if colours.ndim == 1 else colours[:, ::-1]
-        cells = np.floor(points / self._settings.voxel).astype(np.int64) + (1 << (_BITS - 1))
+        cells = np.floor(points / self._cell).astype(np.int64) + (1 << (_BITS - 1))
         inside = ((cells >= 0) & (cells < 1 << _BITS)).all(axis=1)
         keys = (cells[:, 0] << 2 * _BITS) | (cells[:, 1] << _BITS) | cells[:, 2]
         sums = np.concatenate([points, colours, np.ones((len(points), 1))], axis=1)

@@ -19,7 +19,7 @@ from improvo.depth.sparse_depths import ranges_of_run
 from improvo.errors import InputError
 from improvo.files import write_json
 from improvo.geometry import se3
-from improvo.odometry.run import RunSummary
+from improvo.odometry.run import RunSummary, metres_per_unit
 from improvo.sequences import Sequence
 from improvo.sequences.images import grey
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE
@@ -65,25 +65,28 @@ def write_dense(
     ranges = ranges_of_run(folder / POINTS_FILE, folder / TRACKS_FILE, cam_from_world, trajectory.segment)
     cam_from_world[~np.isfinite(ranges).all(axis=1)] = np.nan
     pictures = _Pictures(sequence, summary.report["frames"]["source_index"])
-    cloud = DenseCloud(settings.cloud)
-    K = half_intrinsics(camera.K)
-    farthest = float(np.nanmax(ranges[:, 2])) if np.isfinite(ranges).any() else 1.0
+    numbers = [int(number) for number in np.unique(trajectory.segment) if number >= 0]
+    units = {number: metres_per_unit(summary.report, number) for number in numbers}
+    clouds = {unit: DenseCloud(settings.cloud, unit) for unit in units.values()}
     frames = pixels = known = 0
     interrupted = False
-    with DepthWriter(folder / DEPTH_FILE, K, farthest) as writer:
+    with DepthWriter(folder / DEPTH_FILE, half_intrinsics(camera.K), summary.unit) as writer:
         try:
             for frame, depth_map in depth_maps(
                 pictures.grey, cam_from_world, trajectory.segment, camera.K, lambda row: _triple(ranges[row]), settings
             ):
                 depth_map = without_masked(depth_map, pictures.mask(frame))
                 writer.write(frame, depth_map.depth)
+                cloud = clouds[units[int(trajectory.segment[frame])]]
                 cloud.add(depth_map, pictures.colour(frame), trajectory.world_from_cam[frame])
                 frames, pixels = frames + 1, pixels + depth_map.depth.size
                 known += int((depth_map.depth > 0).sum())
                 progress()
         except KeyboardInterrupt:
             interrupted = True
-    points, colours = cloud.points()
+    parts = [cloud.points() for cloud in clouds.values()]
+    points = np.concatenate([np.zeros((0, 3)), *(xyz for xyz, _ in parts)])
+    colours = np.concatenate([np.zeros((0, 3), np.uint8), *(rgb for _, rgb in parts)])
     write_cloud(folder / CLOUD_FILE, points, colours, summary.unit)
     entry = {
         "frames": frames,
@@ -91,7 +94,6 @@ def write_dense(
         "pixels_with_depth": known,
         "share": round(known / max(pixels, 1), 4),
         "points": len(points),
-        "scale": writer.scale,
         "interrupted": interrupted,
         "seconds": round(time.perf_counter() - started, 3),
     }

@@ -47,7 +47,7 @@ def sweep_prepared(
         K @ other_from_frame[:, :3, :3] @ np.linalg.inv(K),
         other_from_frame[:, :3, 3] @ K.T,
         inverse_depths,
-        (len(others) + 1) // 2,
+        max(min(2, len(others)), (len(others) + 1) // 2),  # half of them, but two where there are two
         volume,
     )
     found = DepthMap.empty(height, width, K)

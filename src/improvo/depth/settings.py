@@ -91,13 +91,13 @@ class AgreementSettings:
 class CloudSettings:
     """The fused point cloud."""
 
-    voxel: float = 0.006  # side of the cell that gets one point; the first median depth is 1
+    voxel: float = 0.006  # side of the cell that gets one point, as a share of the first median depth
     least: int = 2  # other frames that agree on a point
     least_points: int = 2  # pixels, of any frames, that fall into a cell before it gets its point
 
     def __post_init__(self) -> None:
         if not self.voxel > 0:
-            raise ConfigError(f"cloud.voxel={self.voxel}: is a length over 0; the first median depth is 1")
+            raise ConfigError(f"cloud.voxel={self.voxel}: is over 0, and a share of the first median depth")
         if self.least < 0 or self.least_points < 1:
             raise ConfigError(
                 f"cloud.least={self.least}, least_points={self.least_points}: at least 0 frames and 1 pixel"

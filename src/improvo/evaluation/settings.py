@@ -17,6 +17,8 @@ DEFAULT_ESTIMATORS = ("opencv", "poselib" if poselib_installed() else "usac")
 # what frames of `redkitchen` (30 Hz) show of each other 30, 60 and 90 frames apart, in the median
 USUAL_OVERLAPS = (0.8, 0.6, 0.45)
 
+PEERS = ("xfeat", "aliked", "disk")  # other people's networks, see `improvo.evaluation.frontends.peers`
+
 ALIGNMENTS = ("sim3", "se3", "none")
 
 

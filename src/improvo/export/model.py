@@ -76,10 +76,9 @@ def segment_model(run: RunFolder, segment: int, max_error: float = 4.0, min_obse
     good &= enough[point]
     new_row = np.cumsum(enough) - 1
     rgb = np.full((len(xyz), 3), UNKNOWN, np.uint8)
-    of_map = run.points.point[usable]
     if run.map.rgb is not None:
-        in_map = (of_map >= 0) & (of_map < len(run.map))
-        rgb[in_map] = run.map.rgb[of_map[in_map]]
+        row = run.map.rows_of(run.points.point[usable])
+        rgb[row >= 0] = run.map.rgb[row[row >= 0]]
     return Model(
         frames,
         cam_from_world,

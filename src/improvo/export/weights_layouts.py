@@ -9,6 +9,7 @@ stability head.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -201,4 +202,6 @@ def _write_tensors(path: Path, tensors: Tensors, metadata: dict[str, str]) -> No
         return
     torch = imported("torch", "writing .pth, unlike .safetensors,", "train")
     with files.written_atomically(path) as temporary:
-        torch.save({name: torch.from_numpy(values.copy()) for name, values in kept.items()}, temporary)
+        stream = io.BytesIO()  # into a file, torch would write the file's name, which is another one each time
+        torch.save({name: torch.from_numpy(values.copy()) for name, values in kept.items()}, stream)
+        temporary.write_bytes(stream.getvalue())

@@ -1,7 +1,7 @@
 """Images in, `Features` (keypoints, descriptors, scores) out: classical detectors and the network.
 
-It imports no other room. The interface is the class `Frontend` below; then open `registry.py`, which finds a frontend
-by its name and where a new one is added. `classical.py` is the shortest example.
+It imports `jobs` and `untrusted`. The interface is the class `Frontend` below; then open `registry.py`, which finds a
+frontend by its name and where a new one is added. `classical.py` is the shortest example.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 
 from improvo.errors import ConfigError, MissingExtraError, installed
 from improvo.frontend.channel_pruning import without_dead_channels
-from improvo.frontend.settings import NetworkSettings
+from improvo.frontend.settings import NetworkOptions, NetworkSettings
 from improvo.frontend.weights import Weights
 from improvo.jobs.workers import thread_limit
 from improvo.types import Float32
@@ -35,6 +35,13 @@ def cpu_runtime() -> str:
     return "onnxruntime" if installed("onnxruntime") and not installed("openvino") else "openvino"
 
 
+def chosen_runtime(settings: NetworkOptions) -> str:
+    """The library that runs a network with these settings: `openvino`, `onnxruntime` or `torch`."""
+    if settings.runtime != "auto":
+        return settings.runtime
+    return "torch" if settings.device == "cuda" or settings.precision == "float16" else cpu_runtime()
+
+
 def open_runtime(weights: Weights, settings: NetworkSettings) -> Runtime:
     """The runtime that the settings ask for.
 
@@ -43,9 +50,7 @@ def open_runtime(weights: Weights, settings: NetworkSettings) -> Runtime:
         MissingExtraError: the runtime's library is not installed.
     """
     weights = without_dead_channels(weights)
-    name: str = settings.runtime
-    if name == "auto":
-        name = "torch" if settings.device == "cuda" or settings.precision == "float16" else cpu_runtime()
+    name = chosen_runtime(settings)
     if name == "torch":
         from improvo.frontend.runtime_torch import TorchRuntime
 

@@ -1,4 +1,4 @@
-"""Depth at keypoints: what a point of image A is worth as a 3D point."""
+"""Depth at keypoints: the value of a depth image there, or none where it cannot be trusted."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def read_position_track(path: Path | str) -> PositionTrack:
         table = table[np.isfinite(table[:, 3])]
     else:
         table[:, 3] = 0.0
-    stamps, _ = in_seconds(table[:, 0])
+    stamps, _ = in_seconds(table[:, 0], of_video=False)
     order, _ = increasing_order(stamps)
     if len(order) < 3:
         raise InputError(f"{path}: has {len(order)} places with a time, three are needed; {_MEND}")

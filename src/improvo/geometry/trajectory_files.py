@@ -18,7 +18,7 @@ from improvo.errors import InputError
 from improvo.files import write_text
 from improvo.geometry.se3 import quat_xyzw_from_rotation, rigid, rotation_from_quat_xyzw
 from improvo.geometry.text_files import read_text
-from improvo.geometry.time_units import in_seconds
+from improvo.geometry.time_units import in_seconds, note_of
 from improvo.types import Float64, Int64, Trajectory
 from improvo.untrusted.text import is_number
 
@@ -69,7 +69,7 @@ def read_trajectory_report(
         stamps = stamps[: len(values)]
     else:
         stamps, unit = (values[:, 0] * 1e-9, None) if format == "euroc" else in_seconds(values[:, 0])
-        problems += (f"time stamps are taken as {unit}, by their size",) if unit else ()
+        problems += (note_of(unit),) if unit else ()
         w_first = (_quaternion_order(lines) or ("wxyz" if format == "euroc" else "xyzw")) == "wxyz"
         quat_xyzw = values[:, [5, 6, 7, 4]] if w_first else values[:, 4:8]
         matrices = _from_quaternions(quat_xyzw, values[:, 1:4])
@@ -302,7 +302,7 @@ def read_times(path: Path) -> tuple[Float64, tuple[str, ...]]:
     if not np.isfinite(stamps).all():
         raise InputError(f"{path}: holds a time that is not finite; repair or remove it")
     seconds, unit = in_seconds(stamps)
-    return seconds, ((f"{path}: time stamps are taken as {unit}, by their size",) if unit else ())
+    return seconds, ((f"{path}: {note_of(unit)}",) if unit else ())
 
 
 def _counts(rows: list[list[str]]) -> bool:

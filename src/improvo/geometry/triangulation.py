@@ -35,7 +35,6 @@ def triangulate_tracks(
     cam_from_world: Float64,
     K: Float64,
     settings: TriangulationSettings | None = None,
-    points: Float64 | None = None,
 ) -> Triangulation:
     """Robust many-view triangulation.
 
@@ -45,7 +44,6 @@ def triangulate_tracks(
         track_offsets: (T + 1,) the observations of track t are rows track_offsets[t]:track_offsets[t + 1].
         cam_from_world: (N, 4, 4); a row with NaN is a camera without a pose: its observations are left out.
         K: (3, 3).
-        points: (T, 3) points that are known already and only measured; a row with NaN is solved for. None: all are.
 
     Raises:
         ValueError: offsets or indices that do not fit the arrays.
@@ -61,12 +59,8 @@ def triangulate_tracks(
         raise ValueError("track_offsets must rise from 0 to the number of observations")
     if len(camera_index) and not 0 <= camera_index.min() <= camera_index.max() < len(cam_from_world):
         raise ValueError(f"camera_index refers to rows outside 0..{len(cam_from_world) - 1}")
-    known = np.full((len(offsets) - 1, 3), np.nan) if points is None else np.ascontiguousarray(points, np.float64)
-    if known.shape != (len(offsets) - 1, 3):
-        raise ValueError(f"points has shape {known.shape}, expected {(len(offsets) - 1, 3)}")
     intrinsics = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
     found, errors, parallax_deg, in_front = triangulate_all(
-        known,
         keypoints,
         camera_index,
         offsets,

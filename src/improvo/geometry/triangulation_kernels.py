@@ -16,9 +16,7 @@ _FAR = 50.0  # baselines: depth of the start for a point that no ray pair sees i
 
 
 @compiled
-def triangulate_all(
-    known, keypoints, camera_index, offsets, cam_from_world, intrinsics, redescending, width, max_iterations
-):
+def triangulate_all(keypoints, camera_index, offsets, cam_from_world, intrinsics, redescending, width, max_iterations):
     """Points (T, 3), errors (O,), parallax in degrees (T,), in front of all cameras (T,)."""
     tracks = len(offsets) - 1
     points = np.full((tracks, 3), np.nan)
@@ -42,17 +40,15 @@ def triangulate_all(
             if has_pose[camera_index[row]]:
                 rows[count] = row
                 count += 1
-        point[:] = known[t]
-        is_known = np.isfinite(point.sum())
-        if count < (1 if is_known else 2):
+        if count < 2:
             continue
+        point[:] = np.nan
         views = rows[:count]
-        if not is_known:
-            _world_rays(keypoints, camera_index, views, cam_from_world, intrinsics, rays)
-            _start(keypoints, camera_index, views, rays, centres, cam_from_world, intrinsics, redescending, width,
-                   point, candidate)  # fmt: skip
-            _refine(keypoints, camera_index, views, cam_from_world, intrinsics, redescending, width, max_iterations,
-                    point, candidate)  # fmt: skip
+        _world_rays(keypoints, camera_index, views, cam_from_world, intrinsics, rays)
+        _start(keypoints, camera_index, views, rays, centres, cam_from_world, intrinsics, redescending, width,
+               point, candidate)  # fmt: skip
+        _refine(keypoints, camera_index, views, cam_from_world, intrinsics, redescending, width, max_iterations,
+                point, candidate)  # fmt: skip
         points[t] = point
         front = True
         for row in views:

@@ -14,6 +14,7 @@ from improvo.improvement.settings import DEFAULT_START
 from improvo.improvement.split import Split, read_split
 
 SETTINGS, SPLIT, REFERENCE, WEIGHTS = "settings.yaml", "split.json", "reference", "weights.safetensors"
+_FIRST_ROUND = "round-1/judgement.json"  # weights are there before it: those of the start
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,18 @@ class Earlier:
             raise InputError(f"{sequences[0]}: {self.folders[0]} and those before it had all recordings; add new ones")
         return new
 
+    def refuse_taught(self, evaluate: Sequence[Path]) -> None:
+        """What one of them was trained on is not unseen, and cannot be held back.
+
+        Raises:
+            InputError: a recording of `evaluate` is.
+        """
+        for folder, split in zip(self.folders, self.splits, strict=True):
+            taught = {path.resolve() for path in split.training.paths}
+            for path in evaluate:
+                if path.resolve() in taught:
+                    raise InputError(f"{path}: {folder} was trained on it, so it cannot be held back; give others")
+
     def parts(self, kind: str) -> list[ReferencePart]:
         """Their training parts, or what they held back, with the depth that they have of them.
 
@@ -64,10 +77,12 @@ class Earlier:
             kind: `reference.TRAINING` or `reference.HELD_BACK`.
         """
         found: list[ReferencePart] = []
-        for folder, split in zip(self.folders, self.splits, strict=True):
+        names = [folder.name for folder in self.folders]
+        for row, (folder, split) in enumerate(zip(self.folders, self.splits, strict=True)):
             part = split.training if kind == TRAINING else split.held_back
+            name = names[row] if names.count(names[row]) == 1 else f"{names[row]} {len(names) - row}"
             found += [
-                replace(one, name=f"{folder.name}/{one.name}", earlier=True)
+                replace(one, name=f"{name}/{one.name}", earlier=True)
                 for one in reference_parts(folder / REFERENCE, part, kind)
                 if one.depth_file.is_file()
             ]
@@ -86,7 +101,7 @@ def earlier_runs(folder: Path | None) -> Earlier:
     found: list[Path] = []
     while folder is not None:
         folder = folder.resolve()
-        if not all((folder / name).is_file() for name in (SETTINGS, SPLIT, WEIGHTS)):
+        if not all((folder / name).is_file() for name in (SETTINGS, SPLIT, WEIGHTS, _FIRST_ROUND)):
             raise InputError(f"{folder}: is no finished folder of `improvo improve`; finish it, or give another one")
         if folder in found:
             raise InputError(f"{folder}: follows itself; its settings.yaml is damaged")

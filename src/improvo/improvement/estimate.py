@@ -9,7 +9,7 @@ from pathlib import Path
 
 from improvo.errors import OutputError
 from improvo.improvement.recipe import stages, steps_of
-from improvo.improvement.settings import HELD, METRIC, TRACKS, ImproveSettings
+from improvo.improvement.settings import HELD, METRIC, ImproveSettings
 from improvo.terminal import counted
 
 # seconds on two calm cores with `superpoint-small`; `superpoint` takes about four times as long where it trains
@@ -97,9 +97,9 @@ def estimate(
         each += costs.start + (60 * settings.minutes if settings.minutes else steps * costs.step)
     if METRIC in planned:
         each += min(training, reference.most_training) * costs.frame + settings.metric.pairs * _SECONDS_PER_FRAME_PAIR
-    # of a whole recording the reference has the labels of the start already
     labeled = training if settings.teaches_labels else 0
-    again = 0 if settings.recipe == TRACKS or recordings else labeled + held_back
+    # of a whole recording the reference run, which every recipe makes, has the labels of the start already
+    again = 0 if recordings else labeled + held_back
     frames = training + held_back + again + (rounds - 1) * labeled + trainings * held_back
     pairs = max(recordings, 1) * min(settings.validation.matches.pairs, held_back // max(recordings, 1))
     validations = (1 + trainings) * pairs * _GAPS * costs.pair

@@ -15,6 +15,7 @@ from improvo.errors import ConfigError
 from improvo.files import check_output_folder, make_output_folder
 from improvo.improvement.settings import ImproveSettings
 from improvo.locations import removed
+from improvo.sequences.given_files import CONTENTS, contents_of_given
 
 COMMAND = "improve"
 # settings of the optimiser that may differ when a run is continued: none of these alters a result
@@ -98,6 +99,7 @@ class ImproveFolder:
         self.folder = folder
         values = config.to_dict(settings)
         values["frontend"]["name"] = f"sha256:{hashlib.sha256(start.read_bytes()).hexdigest()}"
+        values |= contents_of_given(settings.sequence)
         values["sequences"] = [str(path.resolve()) for path in sequences]
         values["evaluate"] = [str(path.resolve()) for path in evaluate]
         if after is not None:
@@ -161,7 +163,7 @@ class ImproveFolder:
     def _begin(self, values: dict[str, Any]) -> None:
         free = [f"{section}.optimiser.{name}" for section in ("training", "held") for name in _FREE]
         free += ["training.memory_mib", "control"]  # a control may be added later
-        record = SettingsRecord(self.folder / "settings.yaml", ImproveSettings, free)
+        record = SettingsRecord(self.folder / "settings.yaml", ImproveSettings, free, CONTENTS)
         if self.split.is_file():
             self._refuse_former(record)
             record.check(values, "give the same again, or another output folder")

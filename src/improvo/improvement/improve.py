@@ -29,6 +29,7 @@ from improvo.improvement.rounds import Rounds
 from improvo.improvement.settings import ImproveSettings
 from improvo.improvement.split import Split
 from improvo.improvement.validation import Validation, is_better, rule, summary
+from improvo.sequences.given_files import with_absolute_files
 
 if TYPE_CHECKING:
     from improvo.frontend.weights import DataSource
@@ -75,7 +76,8 @@ def improve(
             new. It starts from that folder's weights, unless the settings name a frontend other than the default.
 
     Raises:
-        InputError: nothing could be labelled, or weights that cannot be read.
+        InputError: nothing could be labelled, weights that cannot be read, or a recording of `evaluate` that a folder
+            before this one was trained on.
         ConfigError: the folder was begun with other settings.
         OutputError: the folder is not ours, another process is at work there, or it cannot be written (full disk).
     """
@@ -84,21 +86,23 @@ def improve(
     if output.resolve() in earlier.folders:
         raise ConfigError(f"{output}: cannot follow itself; choose another output folder")
     sequences = earlier.without_known(sequences)
+    earlier.refuse_taught(evaluate)
+    settings = replace(settings, sequence=with_absolute_files(settings.sequence))
     first_weights = earlier.first_weights(settings.frontend.name)
     make_output_folder(output, COMMAND)
     with locked(output):
-        folder = ImproveFolder(output, sequences, evaluate, settings, first_weights, after)
-        loop = Rounds(folder, settings, train or _train, data, workers, ray, progress)
         needed = first_estimate(sequences, settings, rounds, evaluate)
         if needed is not None:
             progress.line(f"estimate: {needed.words}")
-            refuse_full_disk(output, needed)
+            refuse_full_disk(output, needed)  # before the settings are recorded, which fewer steps would contradict
+        folder = ImproveFolder(output, sequences, evaluate, settings, first_weights, after)
+        loop = Rounds(folder, settings, train or _train, data, workers, ray, progress)
         split = loop.split(sequences, evaluate, first_weights)
         progress.split(split)
         start = loop.start(first_weights, split.training)
-        teaching, judging = loop.reference(split)
-        teaching += earlier.parts(TRAINING)
-        judging += earlier.parts(HELD_BACK)
+        replayed, judged_before = earlier.parts(TRAINING), earlier.parts(HELD_BACK)
+        new_teaching, new_judging = loop.reference(split)
+        teaching, judging = new_teaching + replayed, new_judging + judged_before
         result = Improvement(folder.weights, 0, (start,), (loop.validate(start, split.held_back, judging),))
         progress.validated(start, result.validations[0], result.validations[0], settings.validation)
         _keep(result, folder, split, settings)

@@ -55,6 +55,7 @@ def plan_improvement(
     """
     earlier = earlier_runs(after)
     sequences = earlier.without_known(sequences)
+    earlier.refuse_taught(evaluate)
     weights = earlier.first_weights(settings.frontend.name)
     frontend = replace(settings.frontend, name=str(weights))
     paths = list(dict.fromkeys([*sequences, *evaluate]))

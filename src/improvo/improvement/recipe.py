@@ -130,7 +130,7 @@ def _train_metric(job: TrainingJob) -> dict[str, Any]:
 
 
 def _teaching(job: TrainingJob, longer_side: int) -> list[PosedSequence]:
-    """The frames of the reference with depth; of an earlier run's at most every second pair is replayed."""
+    """The frames of the reference with depth. At most half of the pairs that are drawn are of earlier runs."""
     new = [entry for part in job.reference if not part.earlier for entry in part.teaching_frames(longer_side)]
     replayed = [entry for part in job.reference if part.earlier for entry in part.teaching_frames(longer_side)]
     weight = min(len(new) / len(replayed), 1.0) if replayed else 1.0

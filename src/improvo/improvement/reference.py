@@ -142,9 +142,8 @@ def make_depth(
     chosen = chosen[np.isfinite(ranges[chosen]).all(axis=1)]
     seen = np.full_like(poses, np.nan)
     seen[chosen] = poses[chosen]
-    farthest = float(ranges[chosen, 2].max()) if len(chosen) else 1.0
     K = labeled.camera.K
-    with DepthWriter(part.depth_file, half_intrinsics(K), farthest) as writer:
+    with DepthWriter(part.depth_file, half_intrinsics(K)) as writer:
         for frame, found in depth_maps(
             labeled.image, seen, segment, K, lambda row: _triple(ranges[row]), settings.depth
         ):

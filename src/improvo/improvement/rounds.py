@@ -98,15 +98,11 @@ class Rounds:
         return remembered_split(self._folder.split, choose)
 
     def start(self, weights_file: Path, part: Part) -> Candidate:
-        """The candidate at the start: weights as given; where int8 lacks their activation ranges, those are added."""
+        """The candidate at the start: weights as given, with activation ranges of this video as every candidate has."""
         candidate = self._folder.start
         if not candidate.weights.is_file():
             candidate.folder.mkdir(exist_ok=True)
-            weights = load_weights(weights_file)
-            if weights.card.activation_ranges:
-                save_weights(candidate.weights, weights.tensors, weights.card)
-            else:
-                write_calibrated(weights_file, candidate.weights, calibration_images(part, self._images))
+            write_calibrated(weights_file, candidate.weights, calibration_images(part, self._images))
         return candidate
 
     def reference(self, split: Split) -> tuple[list[ReferencePart], list[ReferencePart]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -190,15 +191,17 @@ def is_better(candidate: Validation, best: Validation, settings: ValidationSetti
     return kept and whole and remembered and no_fewer and gain(candidate, best, name, settings.matches).low > 0
 
 
-def summary(validation: Validation, start: Validation, settings: ValidationSettings) -> dict[str, float]:
-    """What the model card says of the best: shares of right matches, its own and those at the start."""
-    values: dict[str, float] = {}
+def summary(validation: Validation, start: Validation, settings: ValidationSettings) -> dict[str, Any]:
+    """What the model card says of the best: shares of right matches, its own and those at the start.
+
+    They are by level, since a level is another number of frames in every recording; `level_N` has these in words.
+    """
+    values: dict[str, Any] = {f"level_{level}": validation.gap_words(level) for level in validation.levels}
     for name in (strict(settings.matches), loose(settings.matches)):
         for level in validation.levels:
-            gap = next(scores.gap for scores in validation.own if scores.level == level)
-            values[f"{name}_gap_{gap}"] = validation.mean(name, level)
-            values[f"{name}_gap_{gap}_at_the_start"] = start.mean(name, level)
-    return {name: round(value, 4) for name, value in values.items()}
+            values[f"{name}_level_{level}"] = round(validation.mean(name, level), 4)
+            values[f"{name}_level_{level}_at_the_start"] = round(start.mean(name, level), 4)
+    return values
 
 
 def write_validation(path: Path, validation: Validation) -> None:

@@ -65,7 +65,9 @@ def start_worker(end: Any = None) -> None:
     """
     import cv2
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and tells the workers
+    for name in ("SIGINT", "SIGHUP"):  # the parent gets it too, and tells the workers
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
     cv2.setNumThreads(1)
     parent = multiprocessing.parent_process()
     if parent is not None:

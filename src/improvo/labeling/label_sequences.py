@@ -32,6 +32,7 @@ from improvo.labeling.store import (
 )
 from improvo.locations import LOCATION_ERRORS, folder_here, lock_files, looked_up, refresh, url_of
 from improvo.odometry.run_settings import RunSettings
+from improvo.sequences.given_files import contents_of_given, with_absolute_files
 
 logger = logging.getLogger(__name__)
 _POLL_SECONDS = 1.0
@@ -105,13 +106,15 @@ def label_sequences(
         MissingExtraError: Ray is not installed.
         OutputError, ConfigError: the store cannot be used, see `LabelStore`, or its location does not answer any more.
     """
-    names = sequence_names(list(paths))
+    sequence_names(list(paths))  # refuses what is given twice before there is a store
+    settings = replace(settings, sequence=with_absolute_files(settings.sequence))
     store = LabelStore(folder, fingerprint(settings, pack), relabel, type(settings))
-    before = {record.name: record for record in store.records() if record.state == DONE}
+    # a failure whose recording is gone leaves its name to whoever comes
+    stored = [record for record in store.records() if record.state == DONE or Path(record.path).exists()]
+    names = sequence_names(list(paths), stored)
+    before = {record.name: record for record in stored if record.state == DONE}
     records = {name: before[name] for name in names if name in before}
-    for name, record in records.items():
-        if record.path != str(names[name]):
-            raise InputError(f"{names[name]}: the store has another recording named {name}; rename one of them")
+    for record in records.values():
         on_record(record)
     url = url_of(store.folder)
     jobs = [
@@ -264,10 +267,10 @@ def _failure(job: LabelJob, error: Exception) -> SequenceRecord:
 
 
 def fingerprint(settings: RunSettings, pack: bool) -> dict[str, Any]:
-    """Everything that the labels depend on; a weights file by its content."""
+    """Everything that the labels depend on; weights, camera and mask by what is in them."""
     import hashlib
 
-    values = {**to_dict(settings), "pack": pack}
+    values = {**to_dict(settings), "pack": pack, **contents_of_given(settings.sequence)}
     weights = Path(settings.frontend.name)
     if weights.suffix == ".safetensors" and weights.is_file():
         values["frontend"]["name"] = f"sha256:{hashlib.sha256(weights.read_bytes()).hexdigest()}"

@@ -76,12 +76,12 @@ def run_and_label(
 
     Arguments, errors and interrupts as `run_odometry`.
     """
-    summary = run_odometry(sequence, folder, settings, command, frontend, visualizer, progress)
+    summary = run_odometry(sequence, folder, settings, command, frontend, visualizer, progress, complete=False)
     return apply_quality_gate(summary, settings.labels)
 
 
 def apply_quality_gate(run: RunSummary, settings: LabelSettings) -> LabeledRun:
-    """Withhold the labels that are not to be trusted; `points.parquet` and `run.json` are written again.
+    """Withhold the labels that are not to be trusted; `points.parquet` is written again, and at last `run.json`.
 
     Args:
         run: a finished run, whose `points.parquet` has the labels of the rule.

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from improvo.odometry.settings import TrackingLossSettings
 from improvo.stability.grouping import medians, rows_of
 from improvo.stability.rule import IGNORE
 from improvo.stability.settings import LabelSettings
@@ -24,6 +25,7 @@ from improvo.stability.tables import Observations, PointsTable
 from improvo.types import Float32, Float64, Int64
 
 Mask = NDArray[np.bool_]
+_LONGEST_LOSS = TrackingLossSettings().max_lost_frames
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ def assess_frames(
         contradictions: (C,) frames at which the odometry's own check contradicted its map.
         settings: of the labels; `settings.quality` has the limits.
         segment: (F,) final segment of each frame, -1 without a pose. After a contradiction the odometry starts a map
-            anew over frames that have misled it once, so all from the segment's first frame on are doubted.
+            anew over frames that have misled it once, so all of its map's frames up to there are doubted.
         doubtful: (F,) frames of segments with a doubtful verdict; None: there are none.
     """
     limits = settings.quality
@@ -109,7 +111,7 @@ def assess_frames(
     for alarm in contradictions:
         first = max(alarm - limits.doubted_before_contradiction, 0)
         if segment is not None and segment[alarm] >= 0:
-            first = min(first, int(np.argmax(segment == segment[alarm])))
+            first = min(first, _first_of_map(segment, int(alarm)))
         contradicted[first : alarm + 1] = True
     return FrameQuality(
         no_pose=~np.asarray(has_pose, np.bool_),
@@ -118,6 +120,20 @@ def assess_frames(
         contradicted=contradicted,
         doubtful=np.zeros_like(contradicted) if doubtful is None else doubtful,
     )
+
+
+def _first_of_map(segment: Int64, frame: int) -> int:
+    """The first frame of the map that a frame lies in.
+
+    Joined maps are one segment. Between them lie frames of others, or more without a pose than a map survives.
+    """
+    first = frame
+    for earlier in range(frame - 1, -1, -1):
+        if segment[earlier] == segment[frame]:
+            first = earlier
+        elif segment[earlier] >= 0 or first - earlier > _LONGEST_LOSS:
+            break
+    return first
 
 
 def doubtful_tracks(parts: Iterable[Observations], facts: TrackFacts, trusted: Mask, settings: LabelSettings) -> Mask:

@@ -20,7 +20,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -38,6 +38,8 @@ from improvo.files import (
 )
 from improvo.folder_lock import LOCK, BusyError, holder_of, locked, seems_held
 from improvo.locations import lock_files, publish, removed
+from improvo.sequences.given_files import CONTENTS
+from improvo.untrusted.paths import is_text
 from improvo.untrusted.text import read_json_file
 
 MANIFEST_FILE, SETTINGS_FILE, RECORD_FILE = "manifest.parquet", "settings.yaml", "label.json"
@@ -95,7 +97,7 @@ class LabelStore:
         check_output_folder(folder, _COMMAND)
         self.folder = folder
         self._refreshed, self._refresh_seconds = 0.0, 0.0
-        made_with = SettingsRecord(folder / SETTINGS_FILE, kind)
+        made_with = SettingsRecord(folder / SETTINGS_FILE, kind, contents=CONTENTS)
         # failures alone, by a wrong mask, say: nothing is lost by other settings
         relabel = relabel or (bool(made_with.difference(settings)) and self._holds_only_failures())
         if not relabel:
@@ -152,11 +154,6 @@ class LabelStore:
         folder = self.folder / f".{name}.partial"
         shutil.rmtree(folder, ignore_errors=True)
         return folder
-
-    def finish(self, record: SequenceRecord) -> None:
-        """The sequence in its partial folder is complete: show it."""
-        finish_sequence(self.folder, record)
-        self.refresh_manifest()
 
     def fail(self, record: SequenceRecord) -> None:
         """The sequence cannot be labelled: keep the reason, drop the rest. The next run tries again."""
@@ -281,20 +278,34 @@ def _read_record(file: Path) -> SequenceRecord:
     raise InputError(f"{file}: is damaged or of another sequence; {mend}")
 
 
-def sequence_names(paths: list[Path]) -> dict[str, Path]:
-    """A folder name for each recording, from its own; the same list gives the same names.
+def sequence_names(paths: list[Path], stored: Iterable[SequenceRecord] = ()) -> dict[str, Path]:
+    """A folder name for each recording: that of its record, else one of its own that no other recording has.
+
+    Args:
+        paths: of the recordings; the same list gives the same names.
+        stored: records of the store that they go to, whatever list they were named in.
 
     Raises:
-        InputError: a recording is named twice.
+        InputError: a recording is named twice, or may be one of the store that has moved.
     """
+    by_path = {record.path: record.name for record in stored}
+    taken = {name: path for path, name in by_path.items()}
     names: dict[str, Path] = {}
     for path in paths:
         resolved = path.resolve()
+        if not is_text(resolved):
+            raise InputError(f"{path}: its name is no text, which tables of labels cannot hold; rename it")
         if resolved in names.values():
             raise InputError(f"{path}: is given twice")
+        known = by_path.get(str(resolved))
         stem = (resolved.stem if resolved.is_file() else resolved.name).lstrip(".") or "sequence"
-        name, number = stem, 2
-        while name in names:
+        if known is None and stem in taken and not Path(taken[stem]).exists():
+            raise InputError(
+                f"{path}: the store has a recording named {stem} of {taken[stem]}, where there is none any more; "
+                "if it has moved, move it back or use another folder"
+            )
+        name, number = known or stem, 2
+        while known is None and (name in names or name in taken):
             name, number = f"{resolved.parent.name}-{stem}" if number == 2 else f"{stem}-{number}", number + 1
         names[name] = resolved
     return names

@@ -1,6 +1,6 @@
 """Folders anywhere: on S3, Google Cloud Storage and all that fsspec reaches, each with a local folder in its stead.
 
-It imports `errors` only. Open this file first, then `place.py`; `claim.py` is about two at once.
+It imports no other room. Open this file first, then `place.py`; `claim.py` is about two at once.
 
 A command gets the local folder and works there as in any other. What is read is fetched when it is first asked for
 (`fetched`); what is complete is sent at once (`written`, called by `improvo.files`) or as a whole (`publish`). Label

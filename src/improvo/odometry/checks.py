@@ -15,11 +15,16 @@ from improvo.geometry.camera import Camera
 from improvo.types import Features, Frame
 
 
-def check_frame(frame: Frame, camera: Camera) -> None:
+def check_frame(frame: Frame, camera: Camera, before: float | None) -> None:
     """Refuse a picture that is not what the camera makes.
 
+    Args:
+        frame: to be tracked.
+        camera: of the odometry.
+        before: time of the frame before; None for the first.
+
     Raises:
-        InputError: it has another size or type, or the time is no number.
+        InputError: it has another size or type, or the time is no number above the one before.
     """
     image: Any = frame.image
     wanted = f"this odometry reads uint8 pictures of {camera.width}x{camera.height}, those of its camera"
@@ -34,11 +39,13 @@ def check_frame(frame: Frame, camera: Camera) -> None:
         own = f"{image.shape[1]}x{image.shape[0]}"
         mend = "resize it, or make a new VisualOdometry with `camera.resized(width, height)`"
         raise InputError(f"{frame.source}: the picture has {own} pixels; {wanted}: {mend}")
-    check_time(frame.time)
+    check_time(frame.time, before)
 
 
-def check_time(time: float) -> None:
-    """Refuse a time that is not a number of seconds.
+def check_time(time: float, before: float | None) -> None:
+    """Refuse a time that is not a number of seconds, or not after that of the frame before; None for the first frame.
+
+    Files and trajectories find a frame by its time, so of two with the same one would be lost.
 
     Raises:
         InputError: it is not.
@@ -49,6 +56,8 @@ def check_time(time: float) -> None:
         finite = False
     if not finite:
         raise InputError(f"time {time!r}: a frame needs a finite time in seconds")
+    if before is not None and not time > before:
+        raise InputError(f"time {time!r}: the frame before was at {before!r}; times of frames increase")
 
 
 def check_features(features: Features, width: int | None) -> None:

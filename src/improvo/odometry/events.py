@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from improvo.odometry.mapping.bridging import Join
 from improvo.odometry.segments import Segment
-from improvo.odometry.verdict.verdict import DOUBTFUL
+from improvo.odometry.verdict.verdict import DOUBTFUL, NOT_JUDGED, Verdict
 
 _WORTH_SAYING = 0.03  # share of the keypoints
 _SAID_AGAIN = 20  # frames
@@ -31,6 +31,7 @@ class EventLog:
         self._last_failure = ""
         self._attached_said = 0.0
         self._two_motions_said = -_SAID_AGAIN - 1
+        self._verdicts: dict[int, Verdict] = {}  # by segment, as told
 
     def segment_started(self, frame_index: int, number: int) -> None:
         """A map has started; the first segment is not worth an event."""
@@ -78,10 +79,17 @@ class EventLog:
         )
 
     def judged(self, segment: Segment) -> None:
-        """A segment has ended; only what a user should know of its verdict is an event."""
+        """A segment has ended; what a user should know of its verdict, and was not told before, is an event.
+
+        Args:
+            segment: with all stretches that were joined with it; it ends with each of them.
+        """
+        before = self._verdicts.get(segment.number, Verdict(NOT_JUDGED))
+        self._verdicts[segment.number] = segment.verdict
         for first, last in segment.verdict.uncertain:
-            self._add(first, "uncertain", f"the scale is not determined between frames {first} and {last}")
-        if segment.verdict.word == DOUBTFUL:
+            if (first, last) not in before.uncertain:
+                self._add(first, "uncertain", f"the scale is not determined between frames {first} and {last}")
+        if segment.verdict.word == DOUBTFUL != before.word:
             self._add(segment.last, "doubtful", f"segment {segment.number}: {segment.verdict.evidence[0]}")
 
     def _add(self, frame_index: int, kind: str, detail: str) -> None:

@@ -19,6 +19,7 @@ _FIELDS = (
     ("observations", "<i4", "int"),
     ("mean_error", "<f4", "float"),
     ("segment", "<i4", "int"),
+    ("id", "<i4", "int"),
 )
 
 _COLOURS = tuple((name, "u1", "uchar") for name in ("red", "green", "blue"))
@@ -31,7 +32,7 @@ def write_map(path: Path, sparse_map: SparseMap, unit: str = "up to scale") -> N
     rows = np.zeros(len(sparse_map), np.dtype([(name, kind) for name, kind, _ in fields]))
     rows["x"], rows["y"], rows["z"] = sparse_map.xyz.T
     rows["observations"], rows["mean_error"] = sparse_map.observations, sparse_map.mean_error
-    rows["segment"] = sparse_map.segment
+    rows["segment"], rows["id"] = sparse_map.segment, sparse_map.ids
     if sparse_map.rgb is not None:
         rows["red"], rows["green"], rows["blue"] = sparse_map.rgb.T
     header = [
@@ -47,7 +48,7 @@ def write_map(path: Path, sparse_map: SparseMap, unit: str = "up to scale") -> N
 
 
 def read_map(path: Path) -> SparseMap:
-    """Read the `map.ply` of a run.
+    """Read the `map.ply` of a run; the ids are -1 in a file from before maps had them.
 
     Raises:
         InputError: missing, damaged, or not written by improvo.
@@ -73,7 +74,7 @@ def read_map(path: Path) -> SparseMap:
         coloured = all(name in (dtype.names or ()) for name, _, _ in _COLOURS)
         rgb = np.stack([vertices[name] for name, _, _ in _COLOURS], axis=1).astype(np.uint8) if coloured else None
         return SparseMap(
-            ids=np.arange(count),
+            ids=vertices["id"].astype(np.int64) if "id" in (dtype.names or ()) else np.full(count, -1),
             xyz=xyz,
             observations=vertices["observations"].astype(np.int64),
             mean_error=mean_error,

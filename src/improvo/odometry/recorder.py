@@ -13,7 +13,7 @@ from improvo.odometry.trajectory_builder import FinalView
 from improvo.stability.rule import label_stability
 from improvo.stability.settings import LabelSettings
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsWriter, TracksWriter
-from improvo.types import Float64, Int64, Tracks
+from improvo.types import Float32, Float64, Int64, Tracks
 
 _FLUSH_EVERY = 200  # final frames
 
@@ -38,7 +38,7 @@ class TrackRecorder:
         self._tracks_writer = TracksWriter(folder / TRACKS_FILE)
         self._points_writer = PointsWriter(folder / POINTS_FILE)
         self._pending: dict[int, FinalView] = {}  # final frames with tracks that are not written yet
-        self._rest: _Rows | None = None  # rows of unfinished tracks from frames before those
+        self._rest = _Rows.none()  # of unfinished tracks from frames before those
         self._next_frame = 0  # all frames before it are final
         self._poses: dict[int, tuple[Float64, int]] = {}  # of frames that unfinished tracks may refer to
         self.counts: Counter[str] = Counter()
@@ -70,19 +70,21 @@ class TrackRecorder:
     def add(self, view: FinalView) -> None:
         """A frame became final (in any order)."""
         self._pending[view.frame_index] = view
-        if len(self._pending) >= _FLUSH_EVERY:
+        # while an early frame is not final, which takes long where the camera stands, no track is finished
+        if len(self._pending) >= _FLUSH_EVERY and self._next_frame in self._pending:
             self._flush()
 
     def _flush(self, everything: bool = False) -> None:
         """Write the tracks that ended in frames all of whose neighbours are final."""
+        parts = [self._rest]
         while self._next_frame in self._pending or (everything and self._pending):
             view = self._pending.pop(self._next_frame, None)
             if view is not None:
-                self._take(view)
+                parts.append(self._taken(view))
             self._next_frame += 1
-        if self._rest is None or len(self._rest.frame) == 0:
+        rows = _Rows.joined(parts).sorted()  # once for all frames: tracks that never end make the rest long
+        if len(rows.frame) == 0:
             return
-        rows = self._rest.sorted()
         last_frame = np.maximum.reduceat(rows.frame, rows.starts)
         # a chain has no gaps, so one that misses the newest final frame is over
         over = np.ones(len(last_frame), bool) if everything else last_frame < self._next_frame - 1
@@ -92,12 +94,13 @@ class TrackRecorder:
         oldest = int(self._rest.frame.min()) if len(self._rest.frame) else self._next_frame
         self._poses = {frame: pose for frame, pose in self._poses.items() if frame >= oldest}
 
-    def _take(self, view: FinalView) -> None:
+    def _taken(self, view: FinalView) -> _Rows:
+        """The rows of a final frame, whose pose is remembered."""
         pose = se3.inverse(view.world_from_cam) if view.segment >= 0 else np.full((4, 4), np.nan)
         self._poses[view.frame_index] = (pose, view.segment)
         frame = np.full(len(view.tracks), view.frame_index)
-        new = _Rows(frame, view.tracks, view.keypoints, view.weights, view.points)
-        self._rest = new if self._rest is None else self._rest.followed_by(new)
+        keypoints, weights = view.keypoints.astype(np.float32), view.weights.astype(np.float32)
+        return _Rows(frame, view.tracks, keypoints, weights, view.points)
 
     def _write(self, rows: _Rows) -> None:
         if len(rows.frame) == 0:
@@ -109,9 +112,7 @@ class TrackRecorder:
         for frame, (pose, number) in self._poses.items():
             if 0 <= frame - first < count:
                 cam_from_world[frame - first], segment[frame - first] = pose, number
-        tracks = Tracks(
-            rows.frame - first, rows.track, rows.keypoints.astype(np.float32), rows.weight.astype(np.float32)
-        )
+        tracks = Tracks(rows.frame - first, rows.track, rows.keypoints, rows.weight)
         labels = label_stability(
             tracks, cam_from_world, segment, self._camera.K, self._settings, point=rows.last_points()
         )
@@ -125,8 +126,19 @@ class TrackRecorder:
 class _Rows:
     """Observations as columns, one row each: (M,) frame, track, weight and point, (M, 2) keypoints."""
 
-    def __init__(self, frame: Int64, track: Int64, keypoints: Float64, weight: Float64, point: Int64) -> None:
+    def __init__(self, frame: Int64, track: Int64, keypoints: Float32, weight: Float32, point: Int64) -> None:
         self.frame, self.track, self.keypoints, self.weight, self.point = frame, track, keypoints, weight, point
+
+    @classmethod
+    def none(cls) -> _Rows:
+        """No row."""
+        number, real = np.zeros(0, np.int64), np.zeros(0, np.float32)
+        return cls(number, number, real.reshape(0, 2), real, number)
+
+    @classmethod
+    def joined(cls, parts: list[_Rows]) -> _Rows:
+        """All rows, one part after the other."""
+        return cls(*(np.concatenate(columns) for columns in zip(*(part._columns for part in parts), strict=True)))
 
     @property
     def _columns(self) -> tuple[np.ndarray, ...]:
@@ -134,9 +146,6 @@ class _Rows:
 
     def take(self, rows: np.ndarray) -> _Rows:
         return _Rows(*(column[rows] for column in self._columns))
-
-    def followed_by(self, other: _Rows) -> _Rows:
-        return _Rows(*(np.concatenate(pair) for pair in zip(self._columns, other._columns, strict=True)))
 
     def sorted(self) -> _Rows:
         """The rows by track, then frame."""

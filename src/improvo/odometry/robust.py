@@ -174,8 +174,8 @@ class RobustMapper(Mapper):
         return adjust(free, fixed, local_map.store, self._camera.K, OBJECTIVE, SOLVER, max_error)
 
     def _confirm(self) -> None:
-        """A map that nothing contradicted for long enough is trusted, and its old frames become final."""
-        if self._states.is_provisional and len(self._provisional) > MEMORY_FRAMES:
+        """A map that was checked and not contradicted for long enough is trusted, and its old frames become final."""
+        if self._states.is_provisional and self._health.has_judged and len(self._provisional) > MEMORY_FRAMES:
             self._states.map_confirmed()
             self._provisional = []
 

@@ -36,6 +36,7 @@ from improvo.sequences import Sequence
 from improvo.terminal import counted
 from improvo.types import Trajectory
 
+_ADDED = ("depth.zip", "dense.ply", "report.html")  # by later steps of some runs
 _MIN_FRAMES = 3
 
 
@@ -63,6 +64,13 @@ def unit_of(report: dict[str, Any]) -> str:
     return str(report["scale"]) if report.get("metric") else "up to scale"
 
 
+def metres_per_unit(report: dict[str, Any], segment: int) -> float:
+    """Metres per unit of the odometry in a segment of a run, by its run.json; 1 where the run is up to scale."""
+    known = {each["segment"]: each["metres_per_unit"] for each in (report.get("metric") or {}).get("segments", [])}
+    before = [number for number in sorted(known) if number <= segment] or sorted(known)[:1]
+    return float(known[before[-1]]) if before else 1.0
+
+
 def run_odometry(
     sequence: Sequence,
     folder: Path,
@@ -71,10 +79,13 @@ def run_odometry(
     frontend: Frontend | None = None,
     visualizer: Visualizer | None = None,
     progress: Callable[[TrackedFrame], None] | None = None,
+    complete: bool = True,
 ) -> RunSummary:
     """Track a sequence and write its trajectory, map, tracks and report into `folder`.
 
-    An interrupt (KeyboardInterrupt) ends the sequence there: what was tracked is written as a valid result.
+    An interrupt (KeyboardInterrupt) ends the sequence there: what was tracked is written as a valid result. The result
+    of an earlier run stays until the first file of this one is there. Then it is gone as a whole: without its run.json
+    a folder is no result, and run.json comes last.
 
     Args:
         sequence: the frames.
@@ -84,6 +95,7 @@ def run_odometry(
         frontend: in place of the one that the settings name.
         visualizer: is shown every frame.
         progress: is called after every frame.
+        complete: False leaves it to the caller to write run.json, after more files.
 
     Raises:
         InputError: fewer than three readable frames.
@@ -109,11 +121,14 @@ def run_odometry(
             frontend, sequence.camera, settings.odometry, settings.frontend.use_stability, on_final=final
         )
         visualizer.begin(sequence.camera)
-        processed, interrupted = _track_all(sequence, frontend, odometry, visualizer, progress, seconds)
-        odometry.finish()
-        visualizer.end()
+        try:
+            processed, interrupted = _track_all(sequence, frontend, odometry, visualizer, progress, seconds)
+            odometry.finish()
+        finally:
+            visualizer.end()
         if len(processed) < _MIN_FRAMES and not interrupted:
             raise InputError(f"{sequence.path}: only {len(processed)} of its frames can be read; check the recording")
+        _remove_result(folder, settings)
     trajectory = odometry.trajectory
     write_trajectory(folder / "trajectory.txt", trajectory)
     sparse_map = odometry.map
@@ -121,8 +136,19 @@ def run_odometry(
     write_map(folder / "map.ply", replace(sparse_map, rgb=rgb))
     seconds["total"] = time.perf_counter() - started
     report = _report(sequence, settings, frontend, odometry, processed, interrupted, recorder.counts, seconds)
-    write_json(folder / "run.json", report)
+    if complete:
+        write_json(folder / "run.json", report)
     return RunSummary(folder, trajectory, report)
+
+
+def _remove_result(folder: Path, settings: RunSettings) -> None:
+    """Take away what an earlier run left, and this one may not write again: first that it is a result."""
+    names = ["run.json", *_ADDED]
+    found, camera = folder / "camera.json", settings.sequence.camera
+    if found.is_file() and (camera is None or Path(camera).absolute() != found.with_suffix(".yaml").absolute()):
+        names += [found.name, "camera.yaml"]  # found for the earlier run, it would be taken for that of this one
+    for name in names:
+        (folder / name).unlink(missing_ok=True)
 
 
 def _track_all(

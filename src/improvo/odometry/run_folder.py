@@ -25,7 +25,7 @@ from improvo.sequences import Sequence, SequenceSettings, open_sequence
 from improvo.stability.rule import IGNORE
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
 from improvo.types import Float64, Int64, SparseMap, Trajectory, UInt8
-from improvo.untrusted.paths import check_path
+from improvo.untrusted.paths import as_text, check_path
 from improvo.untrusted.text import read_json_file, reason
 
 _FORMER_KINDS = {"waiting": "initialising"}  # of events
@@ -81,7 +81,7 @@ class RunFolder:
     @property
     def name(self) -> str:
         """The recording's name."""
-        return self._recorded_input.name or str(self._recorded_input)
+        return as_text(self._recorded_input.name or str(self._recorded_input))
 
     @property
     def unit(self) -> str:

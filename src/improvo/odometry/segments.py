@@ -67,10 +67,12 @@ class SegmentPlacement:
 
         Args:
             cam_from_world: (4, 4) in the segment's own world.
-            depths: (N,) of the map points that the view observes, in the segment's own unit; may be empty.
+            depths: (N,) of the map points that the view observes, in the segment's own unit; may be empty. Those of
+                points behind the camera, which are not positive, tell nothing.
         """
         world_from_cam = self.similarity.apply_to_poses(se3.inverse(cam_from_world)[None])[0]
         self._last_pose = world_from_cam
-        if len(depths):
-            self._last_depth = float(np.median(depths)) * self.similarity.scale
+        in_front = depths[depths > 0]
+        if len(in_front):
+            self._last_depth = float(np.median(in_front)) * self.similarity.scale
         return world_from_cam

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from improvo.backend.settings import ObjectiveSettings
+from improvo.config import SEEDS
 from improvo.errors import ConfigError
 
 
@@ -142,6 +143,8 @@ class OdometrySettings:
     def __post_init__(self) -> None:
         if self.mode not in ("robust", "paper"):
             raise ConfigError(f"mode {self.mode!r}: choose `robust` or `paper`")
+        if not 0 <= self.seed < SEEDS:
+            raise ConfigError(f"seed={self.seed}: must be 0 or more, and less than {SEEDS}")
         if not self.tolerance > 0:
             raise ConfigError(f"tolerance={self.tolerance}: is pixels, and must be positive")
 

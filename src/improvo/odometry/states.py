@@ -34,11 +34,6 @@ class StateMachine:
         self._before_loss = TrackingState.INITIALISING
 
     @property
-    def has_map(self) -> bool:
-        """Whether there is a map."""
-        return self.state is not TrackingState.INITIALISING
-
-    @property
     def is_provisional(self) -> bool:
         """Whether there is a map that may still be started anew; also while it is lost."""
         known = self._before_loss if self.state is TrackingState.LOST else self.state

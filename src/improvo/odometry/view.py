@@ -69,12 +69,12 @@ class PointStore:
 
     @property
     def xyz(self) -> Float64:
-        """(P, 3) world, a view that may be written to."""
+        """(P, 3) world; the array may be written to."""
         return self._xyz[: self.count]
 
     @property
     def last_seen(self) -> Int64:
-        """(P,) position of the last view that observed each point, a view that may be written to."""
+        """(P,) frame_index of the last view that observed each point; the array may be written to."""
         return self._last_seen[: self.count]
 
     def add(self, xyz: Float64, frame_index: int) -> Int64:

@@ -105,11 +105,12 @@ class VisualOdometry:
 
         Raises:
             RuntimeError: the odometry has finished, or another thread is tracking with it.
-            InputError: the picture has another size or type than the camera's; nothing has changed then.
+            InputError: the picture has another size or type than the camera's, or its time is not after that of the
+                frame before; nothing has changed then.
         """
         with self._thread.alone():
             self._refuse_if_finished()
-            check_frame(frame, self._camera)
+            check_frame(frame, self._camera, self._time_before)
             return self.track_features(self.detect(frame), frame.time, frame.image)
 
     def detect(self, frame: Frame) -> Features:
@@ -123,7 +124,7 @@ class VisualOdometry:
         """
         with self._thread.alone():
             self._refuse_if_finished()
-            check_time(time)
+            check_time(time, self._time_before)
             return self.track_matched(self.match(features), time, image)
 
     def match(self, features: Features) -> MatchedFeatures:
@@ -146,6 +147,7 @@ class VisualOdometry:
         """As `track_features`, with what `match` gave for the frame at hand."""
         with self._thread.alone():
             self._refuse_if_finished()
+            check_time(time, self._time_before)
             return self._track(matched, time, image)
 
     def _track(self, matched: MatchedFeatures, time: float, image: UInt8 | None) -> TrackedFrame:
@@ -216,6 +218,10 @@ class VisualOdometry:
         """(P, 3) points of the running segment, in its own world as `pose` is."""
         local_map = None if self._mapper is None else self._mapper.local_map
         return np.zeros((0, 3)) if local_map is None else local_map.store.xyz
+
+    @property
+    def _time_before(self) -> float | None:
+        return None if self._newest is None else self._newest.time
 
     def _so_far(self) -> OdometryResult:
         return self._result if self._mapper is None or self._finished else self._mapper.so_far()

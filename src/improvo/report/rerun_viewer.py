@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from improvo.errors import OutputError, imported
-from improvo.files import written_atomically
+from improvo.files import check_output_file, written_atomically
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.odometry.run_folder import RunFolder
@@ -41,6 +41,7 @@ class RerunViewer:
 
     def __init__(self, save: Path | None = None, palette: Palette = PALETTES["paper"]) -> None:
         self._recording = _Recording(save)
+        self.failure: OutputError | None = None  # of the file to save, when the run is over
         self._palette = palette
         self._births: dict[int, int] = {}  # track -> the frame where it began
         self._path: list[Float64] = []
@@ -84,8 +85,11 @@ class RerunViewer:
             self._recording.points(points[seen], self._palette.ramp_colours(1 - weights, 0, 1), "world/observed")
 
     def end(self) -> None:
-        """The run is over."""
-        self._recording.close()
+        """The run is over. What the file could not hold must not cost its results, so `failure` keeps the error."""
+        try:
+            self._recording.close()
+        except OutputError as error:
+            self.failure = error
 
 
 def show_run(
@@ -135,8 +139,10 @@ class _Recording:
 
     def __init__(self, save: Path | None) -> None:
         rerun = imported("rerun", "the live viewer", "view")
-        if save is not None and not save.absolute().parent.is_dir():
-            raise OutputError(f"{save}: no folder {save.parent}; make it first")
+        if save is not None:
+            check_output_file(save, (".rrd",))
+            if not save.absolute().parent.is_dir():
+                raise OutputError(f"{save}: no folder {save.parent}; make it first")
         self._rerun: Any = rerun
         self._save = save
         self._files = ExitStack()
@@ -155,9 +161,14 @@ class _Recording:
         self._log("world/camera/image", pinhole, static=True)
 
     def close(self) -> None:
-        self._stream.flush()
-        self._stream.disconnect()
-        self._files.close()
+        with self._files:
+            try:
+                self._stream.flush()
+            except RuntimeError:  # what Rerun says when its writer could not go on
+                if self._save is not None:
+                    raise OutputError(f"{self._save}: cannot be written (is the disk full?); choose another") from None
+            finally:
+                self._stream.disconnect()
 
     def _log(self, path: str, what: Any, static: bool = False) -> None:
         self._stream.log(path, what, static=static)

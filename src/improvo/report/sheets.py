@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -46,15 +48,20 @@ def write_video(path: Path, pictures: Iterable[UInt8], fps: float, width: int | 
         return
     first = next(pictures)
     height, width = (side - side % 2 for side in first.shape[:2])  # codecs want even sides
-    with written_atomically(path) as temporary:
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages would drown the one line that says what to do
+    with written_atomically(path) as temporary, _without_messages():
         writer = _writer(temporary, _CODECS.get(path.suffix.lower(), ()), max(fps, 1.0), width, height)
         if writer is None:
             raise OutputError(f"{path}: OpenCV cannot write such a video here; try .mp4, or a folder for PNG files")
         try:
+            written = 0
             for rgb in _chain(first, pictures):
                 writer.write(np.ascontiguousarray(rgb[:height, :width, ::-1]))
+                written += 1
         finally:
             writer.release()
+        if _frames_in(temporary) < written:  # OpenCV does not say so
+            raise OutputError(f"{path}: cannot be written (is the disk full?); choose another folder")
 
 
 def _resized(picture: UInt8, width: int | None) -> UInt8:
@@ -81,20 +88,39 @@ def _writer(path: Path, codecs: tuple[str, ...], fps: float, width: int, height:
 
     if not is_text(path):  # OpenCV ends the process
         return None
-    # OpenCV's own warning that a codec is not usual in MP4 would only worry people
+    for codec in codecs:
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), fps, (width, height))
+        if writer.isOpened():
+            return writer
+    return None
+
+
+@contextmanager
+def _without_messages() -> Iterator[None]:
+    """OpenCV's own, that a codec is not usual in MP4 or that a frame could not be written, would only worry people."""
+    import cv2
+
     log = getattr(cv2.utils, "logging", None)
     level = log.getLogLevel() if log else None
     if log:
         log.setLogLevel(log.LOG_LEVEL_SILENT)
     try:
-        for codec in codecs:
-            writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), fps, (width, height))
-            if writer.isOpened():
-                return writer
+        yield
     finally:
         if log:
             log.setLogLevel(level)
-    return None
+
+
+def _frames_in(path: Path) -> int:
+    """How many frames are in a video, by its packets, which are not decoded."""
+    import cv2
+
+    packets = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+    count = 0
+    while packets.grab():
+        count += 1
+    packets.release()
+    return count
 
 
 def _chain(first: UInt8, rest: Iterator[UInt8]) -> Iterator[UInt8]:

@@ -1,4 +1,4 @@
 """A camera from the video itself: the odometry runs with a guess, and the camera is adjusted with its views and points.
 
-It imports `odometry`, `sequences`, `frontend`, `tracking` and `geometry`. Open `from_motion.py` first.
+It imports `odometry`, `sequences`, `frontend`, `tracking`, `geometry` and `untrusted`. Open `from_motion.py` first.
 """

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from improvo.config import to_dict
 from improvo.errors import ConfigError, InputError
-from improvo.files import write_json
+from improvo.files import write_json, write_text
 from improvo.odometry.run import RunSummary
 from improvo.self_calibration.from_motion import CameraFromMotion, Told, camera_from_motion
 from improvo.self_calibration.settings import SelfCalibrationSettings
@@ -31,6 +31,7 @@ def find_cameras(
     search: SelfCalibrationSettings | None = None,
     told: Told = lambda stage, done, total: None,
     on_found: Callable[[Path, CameraFromMotion | InputError | None], object] = lambda path, found: None,
+    before: Path | None = None,
 ) -> SequenceSettings:
     """Settings in which `camera: auto` has become files: found from each recording, or as an earlier call left them.
 
@@ -41,6 +42,7 @@ def find_cameras(
         search: settings of the search.
         told: is called with a stage in words, and how far it is.
         on_found: is told each camera, the error of a recording that does not tell it, or None where it was there.
+        before: folder of an earlier call for these recordings; what it found is copied from there.
 
     Raises:
         InputError: none of the recordings tells its camera.
@@ -50,7 +52,7 @@ def find_cameras(
         return settings
     if len(recordings) == 1:
         target = folder / SINGLE
-        _find(recordings[0], settings, target, search, told, on_found)
+        _find(recordings[0], settings, target, search, told, on_found, None if before is None else before / SINGLE)
         return replace(settings, camera=str(target))
     names: dict[str, Path] = {}
     for path in recordings:
@@ -62,7 +64,8 @@ def find_cameras(
     errors: list[InputError] = []
     for name, path in names.items():
         try:
-            _find(path, settings, cameras / f"{name}.yaml", search, told, on_found)
+            earlier = None if before is None else before / FOLDER / f"{name}.yaml"
+            _find(path, settings, cameras / f"{name}.yaml", search, told, on_found, earlier)
         except InputError as error:  # noqa: PERF203 - the others go on
             errors.append(error)
             on_found(path, error)
@@ -89,17 +92,26 @@ def _find(
     search: SelfCalibrationSettings | None,
     told: Told,
     on_found: Callable[[Path, CameraFromMotion | InputError | None], object],
+    earlier: Path | None,
 ) -> None:
-    """Write `target`, unless it is there for the same recording, read in the same way."""
+    """Write `target`, unless it or `earlier` is there for the same recording, read in the same way."""
     how = replace(search or SelfCalibrationSettings(), sequence=settings)
     request = _request(path, how)
-    side = target.with_suffix(".json")
-    if target.is_file() and side.is_file() and read_json_file(side, "delete it").get("request") == request:
-        on_found(path, None)
-        return
+    for known in (target, earlier):
+        if known is not None and _is_of(known, request):
+            if known != target:
+                for suffix in (".yaml", ".json"):
+                    write_text(target.with_suffix(suffix), known.with_suffix(suffix).read_text())
+            on_found(path, None)
+            return
     found = camera_from_motion(path, how, told)
     found.write(target, request)
     on_found(path, found)
+
+
+def _is_of(camera: Path, request: dict[str, Any]) -> bool:
+    side = camera.with_suffix(".json")
+    return camera.is_file() and side.is_file() and read_json_file(side, "delete it").get("request") == request
 
 
 def _request(path: Path, settings: SelfCalibrationSettings) -> dict[str, Any]:

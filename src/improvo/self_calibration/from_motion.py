@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -92,6 +93,8 @@ class CameraFromMotion:
             f"# from the motion of {self.tracked} frames ({self.views} views adjusted): RMS {self.rms:.3f} px; "
             f"standard deviations {deviations}\n"
         )
+        with suppress(OSError):  # a stop between the two files must not leave those of different recordings
+            path.with_suffix(".json").unlink(missing_ok=True)
         write_text(path, comment + calibration_yaml(self.camera))
         write_json(path.with_suffix(".json"), {"found": self.figures, "request": request or {}})
 

@@ -58,7 +58,7 @@ class ImageFolder(Recording):
             files, self.times = [files[row] for row in order], times[order]
         elif stamps is not None and settings.fps is None:
             order, _ = increasing_order(stamps)
-            files, (self.times, unit) = [files[row] for row in order], in_seconds(stamps[order])
+            files, (self.times, unit) = [files[row] for row in order], in_seconds(stamps[order], of_video=False)
             notes.append(f"{path}: the names of the files are taken as time stamps in {unit or 'seconds'}")
         else:
             rate, note = frame_rate(self.calibration, settings, path)
@@ -113,7 +113,7 @@ def _stamps_in_names(files: list[Path]) -> Float64 | None:
         return None
     texts = [match.group(1) for match in matches if match is not None]
     stamps = np.array([float(text) for text in texts], np.float64)
-    date = unit_of(stamps) != "seconds" or all("." in text for text in texts)
+    date = unit_of(stamps, of_video=False) != "seconds" or all("." in text for text in texts)
     return stamps if date and (np.diff(np.sort(stamps)) > 0).all() else None
 
 

@@ -80,9 +80,10 @@ class LiveStream(Recording):
             self._thread.join(FRAME_TIMEOUT)
 
     def _watch(self) -> None:
+        began = time.time() - time.perf_counter()  # a clock that is set meanwhile would let a time come twice
         while not self._ended:
             read, image = self._capture.read()
-            now = time.time()
+            now = began + time.perf_counter()
             with self._arrived:
                 if not read or image is None:
                     self._ended = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -10,7 +11,9 @@ from improvo.errors import InputError
 from improvo.sequences.base import SequenceSettings
 from improvo.sequences.images import grey
 from improvo.sequences.live import LiveStream
-from improvo.sequences.sequence import Sequence
+from improvo.sequences.mask import chosen_mask
+from improvo.sequences.rates import recording_name
+from improvo.sequences.sequence import Sequence, refuse_impossible
 from improvo.types import Float32, Float64, Frame, Trajectory
 
 
@@ -19,9 +22,17 @@ class LiveSequence(Sequence):
 
     It has no length (`len` raises TypeError, as for any Python stream) and can be iterated once; `times` are those of
     the frames so far. `notes` counts the frames that were dropped because the reader was busy.
+
+    Raises:
+        InputError: no frame came, or settings that need a recording: a start, an end, or a mask for each frame.
     """
 
     def __init__(self, recording: LiveStream, settings: SequenceSettings) -> None:
+        try:
+            _refuse_what_needs_a_recording(recording.path, settings)
+        except InputError:
+            recording.close()
+            raise
         first = recording.next_frame()
         if first is None:
             recording.close()
@@ -30,7 +41,11 @@ class LiveSequence(Sequence):
         self._first: tuple[float, np.ndarray] | None = first
         self._so_far: list[float] = []
         height, width = first[1].shape[:2]
-        self._set_up(recording, settings, width, height)
+        try:
+            self._set_up(recording, settings, width, height)
+        except InputError:
+            recording.close()
+            raise
 
     @property
     def times(self) -> Float64:
@@ -78,3 +93,15 @@ class LiveSequence(Sequence):
 
     def depth(self, i: int) -> Float32 | None:
         return None
+
+
+def _refuse_what_needs_a_recording(path: Path, settings: SequenceSettings) -> None:
+    refuse_impossible(path, settings)
+    if settings.start or settings.end is not None:
+        given = "start" if settings.start else "end"
+        raise InputError(
+            f"{path}: is live, so `{given}` cannot be used: it begins with the next frame and ends with the source, or "
+            "after `max_frames`"
+        )
+    if settings.mask is not None and chosen_mask(Path(settings.mask), recording_name(path)).is_dir():
+        raise InputError(f"{settings.mask}: is a folder, and {path} is live; give one mask for all frames")

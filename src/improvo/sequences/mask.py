@@ -41,7 +41,7 @@ class SequenceMasks:
     def __init__(self, path: str, recording: Recording, name: str, rectifier: Rectifier) -> None:
         self._rectifier = rectifier
         self._size = rectifier.raw.width, rectifier.raw.height
-        chosen = _chosen(Path(path), name)
+        chosen = chosen_mask(Path(path), name)
         self._files: list[Path] | None = None
         self._read = lru_cache(maxsize=4)(self._delivered)
         if chosen.is_dir():
@@ -131,8 +131,12 @@ def _image(file: Path) -> UInt8:
         raise InputError(f"{file}: cannot be read as a mask ({error}); give an image, white where used") from None
 
 
-def _chosen(path: Path, name: str) -> Path:
-    """The part of the path that belongs to the recording."""
+def chosen_mask(path: Path, name: str) -> Path:
+    """The part of a path of masks that belongs to the recording `name`.
+
+    Raises:
+        InputError: nothing there.
+    """
     if not path.exists():
         raise InputError(f"--mask {path}: no such file or folder; `improvo info SEQUENCE --write-mask FILE` makes one")
     if not path.is_dir():

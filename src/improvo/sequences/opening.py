@@ -81,8 +81,8 @@ def open_recording(path: Path | str, settings: SequenceSettings | None = None, *
     """The recording as it lies on disk: raw images, needs no calibration. Arguments and errors as `open_sequence`."""
     settings = _with_overrides(settings, overrides)
     path = check_path(Path(path))
-    if settings.fps is not None and not settings.fps > 0:
-        raise InputError(f"{path}: fps {settings.fps:g} must be positive")
+    if settings.fps is not None and not 1e-6 <= settings.fps <= 1e6:
+        raise InputError(f"{path}: fps {settings.fps:g} is no number of frames a second; between 1e-06 and 1e+06")
     try:
         recording = _recording(path, settings)
         if path.is_file():

@@ -19,6 +19,7 @@ from improvo.sequences.mask import SequenceMasks
 from improvo.sequences.rates import AUTO, given_calibration, recording_name
 from improvo.sequences.rectification import Rectifier
 from improvo.types import Float32, Float64, Frame, Int64, Mask, Trajectory, UInt8
+from improvo.untrusted.paths import as_text
 
 _MOST_ENLARGED = 4  # times that --width may make pictures wider
 _PROBES = 20  # frames tried for the image size before a recording counts as unreadable
@@ -46,7 +47,7 @@ class Sequence:
         self.settings = settings
         self.path: Path = recording.path
         self.format = recording.format
-        self.name = recording_name(recording.path)
+        self.name = as_text(recording_name(recording.path))
         self._skipped: dict[int, SkippedFrame] = {}
         self._raw_size = (width, height)
         if settings.width is not None and settings.width < 8:
@@ -216,12 +217,7 @@ def selected(recording: Recording, settings: SequenceSettings) -> Int64:
     Raises:
         InputError: impossible settings, or nothing left.
     """
-    if settings.stride < 1:
-        raise InputError(f"{recording.path}: stride {settings.stride} must be at least 1")
-    if settings.max_frames is not None and settings.max_frames < 1:
-        raise InputError(f"{recording.path}: max_frames {settings.max_frames} must be at least 1")
-    if settings.start < 0 or (settings.end is not None and settings.end < 0):
-        raise InputError(f"{recording.path}: start and end count frames from 0 and cannot be negative")
+    refuse_impossible(recording.path, settings)
     count = len(recording)
     end = count if settings.end is None else min(settings.end, count)
     indices = np.arange(settings.start, end, settings.stride, dtype=np.int64)[: settings.max_frames]
@@ -230,6 +226,20 @@ def selected(recording: Recording, settings: SequenceSettings) -> Int64:
             f"{recording.path}: has {count} frames, none of them from {settings.start} to {end}; change start or end"
         )
     return indices
+
+
+def refuse_impossible(path: Path, settings: SequenceSettings) -> None:
+    """Refuse a selection of frames that no recording has.
+
+    Raises:
+        InputError: a stride or a number of frames below 1, or a negative start or end.
+    """
+    if settings.stride < 1:
+        raise InputError(f"{path}: stride {settings.stride} must be at least 1")
+    if settings.max_frames is not None and settings.max_frames < 1:
+        raise InputError(f"{path}: max_frames {settings.max_frames} must be at least 1")
+    if settings.start < 0 or (settings.end is not None and settings.end < 0):
+        raise InputError(f"{path}: start and end count frames from 0 and cannot be negative")
 
 
 def _calibration(recording: Recording, settings: SequenceSettings, width: int, height: int) -> Calibration:

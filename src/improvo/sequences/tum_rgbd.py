@@ -14,7 +14,7 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, folder_calibration
 from improvo.geometry.text_files import read_text
-from improvo.geometry.time_units import in_seconds
+from improvo.geometry.time_units import in_seconds, note_of
 from improvo.geometry.trajectory_files import increasing_order, read_trajectory_report
 from improvo.sequences.association import nearest
 from improvo.sequences.base import Recording, SequenceSettings
@@ -112,7 +112,7 @@ def _read_list(path: Path, kind: str) -> tuple[Float64, list[Path], list[str]]:
     order, repeated = increasing_order(stamps)
     notes = [f"{path}: {bad} rows are not `timestamp filename` and were left out"] if bad else []
     notes += [f"{path}: {repeated} rows repeat a time stamp and were left out"] if repeated else []
-    notes += [f"{path}: time stamps are taken as {unit}, by their size"] if unit else []
+    notes += [f"{path}: {note_of(unit)}"] if unit else []
     return stamps[order], [files[row] for row in order], notes
 
 

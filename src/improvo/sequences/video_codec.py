@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 
 _HEAD = 4096  # bytes; every container has a NUL in them, no text has
@@ -41,7 +42,7 @@ def why_unreadable(path: Path) -> str:
     if codec is not None:
         return (
             f"its codec, {codec}, cannot be decoded here (or the file is cut short); convert it: ffmpeg -i "
-            f"{path.name} -c:v libx264 -crf 16 converted.mp4"
+            f"{shlex.quote(path.name)} -c:v libx264 -crf 16 converted.mp4"
         )
     if has_sound_alone(path):
         return "holds sound, and no pictures; give the video"
@@ -61,7 +62,7 @@ def video_codec(path: Path) -> str | None:
 
 
 def has_sound_alone(path: Path) -> bool:
-    """Whether a file is a recording of sound (WAV, MP3, FLAC, Ogg, or an MP4 without a track of pictures)."""
+    """Whether a file is a recording of sound (WAV, MP3, FLAC, or an MP4 without a track of pictures)."""
     data = _ends(path)
     if data.startswith((b"ID3", b"fLaC", b"\xff\xfb")) or (data.startswith(b"RIFF") and data[8:12] == b"WAVE"):
         return True

@@ -1,6 +1,7 @@
 """Simulated rooms with exact depth, poses and causes of instability, and the small recording that ships with improvo.
 
-It imports `geometry`. Open `generate.py` first: a recording from its settings. `scene.py` puts one room together.
+It imports `geometry` and `jobs`. Open `generate.py` first: a recording from its settings. `scene.py` puts one room
+together.
 """
 
 from __future__ import annotations

@@ -56,6 +56,8 @@ class TumRgbdWriter:
             (folder / "rgb").mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"{folder}: cannot be created ({error.strerror}); choose another folder") from None
+        for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):  # the lists of an earlier recording of other pictures
+            (folder / name).unlink(missing_ok=True)
         write_text(folder / "camera.yaml", calibration_yaml(camera, fps, depth_scale))
 
     def __enter__(self) -> TumRgbdWriter:

@@ -70,7 +70,6 @@ def label_stability(
     K: Float64,
     settings: LabelSettings | None = None,
     point: Int64 | None = None,
-    point_xyz: Float64 | None = None,
 ) -> TrackLabels:
     """Label whole tracks under final poses; any subset of tracks gives the same labels as all at once.
 
@@ -81,7 +80,6 @@ def label_stability(
         K: (3, 3).
         settings: the rule, and how a track's point is found.
         point: (T,) map point of each track in the order in which the tracks appear, -1 where none; for the record.
-        point_xyz: (T, 3) where the odometry already has the point, NaN where it is to be solved here.
 
     Returns:
         Labels. A point behind one of the cameras that saw it is never called stable.
@@ -106,7 +104,6 @@ def label_stability(
         cam_from_world,
         K,
         TriangulationSettings(loss=settings.loss, loss_width=settings.loss_width),
-        points=point_xyz,
     )
     errors = np.full(len(tracks), np.nan)
     errors[rows] = solved.errors

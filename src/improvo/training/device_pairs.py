@@ -36,6 +36,9 @@ class DevicePairs:
         pictures: homography pairs are made of these, and of the frames of `posed`.
         detector: its logits choose keypoints and are held to.
         stability: likewise, for every `stability_every`-th view.
+
+    Raises:
+        InputError: neither pictures nor posed sequences of which two frames overlap.
     """
 
     def __init__(
@@ -62,6 +65,12 @@ class DevicePairs:
         self.pairs = [overlapping_pairs(sequence, settings.pairs) for sequence in posed]
         self.weights = np.array([sequence.weight for sequence in posed])
         self.useful = [row for row, pairs in enumerate(self.pairs) if pairs is not None]
+        if not self.sources and not self.useful:
+            names = ", ".join(sequence.name for sequence in posed)
+            raise InputError(
+                f"nothing to train on: no two frames of {names} show enough of the same places; give pictures too, or "
+                "recordings of a camera that moves less between frames"
+            )
         self.whole = settings.pairs.whole_frames if settings.pairs.two_frames and self.useful else 0
         self.whole_frames = WholeFrames(self.store, self._taught_of_each, settings.pairs.frames_remembered)
         self.process = Process.current()

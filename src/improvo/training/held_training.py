@@ -20,7 +20,7 @@ from improvo.training.held_settings import HeldSettings
 from improvo.training.networks import started_network
 from improvo.training.pictures import Pictures
 from improvo.training.posed import PosedSequence
-from improvo.training.stage_folder import model_card, run_stage
+from improvo.training.stage_folder import model_card, not_stated, run_stage
 from improvo.training.teacher import network_teacher
 from improvo.training.trainer import Batches, choose_device, choose_precision
 
@@ -62,9 +62,9 @@ def train_held(
     batches = dense if dense.whole else _with_tracks(dense, labels, output)
     if not data:
         names = (*(source.name for source in pictures.sources), *(sequence.name for sequence in posed))
-        data = tuple(DataSource(name, "not stated") for name in names)
+        data = not_stated(names)
     published = replace(parent.architecture, stability=stability is not None)
-    card = model_card(published, "held", settings, data, start.name)
+    card = model_card(published, "held", settings, data, start)
     card.training.update(
         stability_trained=stability is not None,
         stability_from=stability_from.name if stability_from else "",

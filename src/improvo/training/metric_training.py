@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -19,12 +20,12 @@ from improvo.frontend.settings import NetworkSettings
 from improvo.frontend.weights import DataSource, load_weights, save_weights
 from improvo.training.descriptor_metric import MetricSettings, Scatter, found_again, with_descriptor_map
 from improvo.training.held_settings import DevicePairSettings
-from improvo.training.metrics import METRICS, append_metrics
+from improvo.training.metrics import METRICS, append_metrics, read_metrics
 from improvo.training.photometric import augment
 from improvo.training.posed import PosedSequence, overlapping_pairs
 from improvo.training.posed_frames import PosedFrames
 from improvo.training.settings import PhotometricSettings, ViewSettings
-from improvo.training.stage_folder import SETTINGS, WEIGHTS, commit_of_code, stage_folder
+from improvo.training.stage_folder import SETTINGS, WEIGHTS, commit_of_code, learned_from, not_stated, stage_folder
 from improvo.training.views import inside, random_view, warp_image, warp_points
 from improvo.types import Features, Float64, Int64, Mask, UInt8
 
@@ -60,6 +61,10 @@ def train_metric(
         record, values = SettingsRecord(output / SETTINGS, MetricSettings, []), config.to_dict(settings)
         record.check(values, "give the same settings or another output folder")
         record.write(values)
+        started_from = {"start": start.name, "start_sha256": hashlib.sha256(start.read_bytes()).hexdigest()}
+        rows = read_metrics(output / METRICS)
+        if rows and _is_of(output / WEIGHTS, started_from):
+            return rows[-1]
         weights = load_weights(start)
         frontend = NetworkFrontend(weights, NetworkSettings(max_keypoints=settings.max_keypoints))
         scatter, pairs = Scatter(weights.architecture.descriptor), 0
@@ -70,18 +75,27 @@ def train_metric(
             pairs += 1
         mapped = with_descriptor_map(weights, scatter.map(settings.shrinkage))
         row = {"step": pairs, "correspondences": scatter.count, "seconds": round(time.monotonic() - begun)}
-        own = data or tuple(DataSource(sequence.name, "not stated") for sequence in posed)
-        sources = {source.name: source for source in (*weights.card.data, *own)}
+        own = data or not_stated(sequence.name for sequence in posed)
         training = {
             **weights.card.training,
-            "metric": {"start": start.name, "settings": values, "pairs": pairs, "correspondences": scatter.count},
+            "metric": {**started_from, "settings": values, "pairs": pairs, "correspondences": scatter.count},
         }
         # the map changes no activation, so that the ranges for int8 stay
-        card = replace(weights.card, data=tuple(sources.values()), training=training, commit=commit_of_code())
+        card = replace(
+            weights.card, data=learned_from(weights.card.data, own), training=training, commit=commit_of_code()
+        )
         files.write_text(output / METRICS, "")
         append_metrics(output / METRICS, row)
         save_weights(output / WEIGHTS, mapped.tensors, card)
     return row
+
+
+def _is_of(path: Path, started_from: dict[str, str]) -> bool:
+    """Whether the weights are there, and of this start."""
+    if not path.is_file():
+        return False
+    made = load_weights(path).card.training.get("metric", {})
+    return all(made.get(name) == value for name, value in started_from.items())
 
 
 def _frame_pairs(posed: Sequence[PosedSequence], frontend: NetworkFrontend, settings: MetricSettings) -> Iterator[Pair]:

@@ -23,8 +23,8 @@ def published_architecture(name: str) -> Architecture:
     return replace(ARCHITECTURES[name], stability=False)
 
 
-def first_network(name: str, seed: int, start: Path | None, stem: int = 0) -> tuple[SuperPoint, str]:
-    """A network without the stability head, which only VO adaptation can teach, and the name of its parent weights.
+def first_network(name: str, seed: int, start: Path | None, stem: int = 0) -> SuperPoint:
+    """A network without the stability head, which only VO adaptation can teach.
 
     Args:
         name: of the architecture.
@@ -44,7 +44,7 @@ def first_network(name: str, seed: int, start: Path | None, stem: int = 0) -> tu
         architecture = replace(architecture, encoder=(stem,) * STEM_LAYERS + architecture.encoder[STEM_LAYERS:])
     elif weights and _widths(weights.architecture) == _widths(architecture):
         architecture = replace(without_dead_channels(weights).architecture, stability=False)
-    return started_network(architecture, seed, weights), start.name if start else ""
+    return started_network(architecture, seed, weights)
 
 
 def started_network(architecture: Architecture, seed: int, weights: Weights | None) -> SuperPoint:

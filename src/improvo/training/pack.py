@@ -20,7 +20,7 @@ from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.images import decode
 from improvo.training.pictures import Pictures, Source
 from improvo.training.posed import PosedSequence
-from improvo.types import Float32, UInt8
+from improvo.types import Float32, Mask, UInt8
 from improvo.untrusted.arrays import FAULTS
 from improvo.untrusted.text import load_json, reason
 
@@ -32,21 +32,23 @@ _DEPTH_LEVELS = 4095  # of inverse depth: fine enough for 3 % at a twelfth of th
 def write_pack(
     path: Path, pictures: Pictures, posed: Sequence[PosedSequence], data: Sequence[DataSource], quality: int = 75
 ) -> None:
-    """Write a ZIP of WebP pictures, PNG depths and `index.json`.
+    """Write a ZIP of WebP pictures, PNG depths and masks, and `index.json`.
 
     Args:
         quality: of WebP.
     """
     index: dict[str, Any] = {"sources": [], "posed": [], "data": [asdict(source) for source in data]}
+    index["skipped"] = list(pictures.skipped)
     with written_atomically(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as file:
         for number, source in enumerate(pictures.sources):
             names = [f"s{number}/{row}.webp" for row in range(len(source.pictures))]
             for name, picture in zip(names, source.pictures, strict=True):
                 file.writestr(name, _webp(picture, quality))
             rotating = None if source.rotating is None else source.rotating.tolist()
-            index["sources"].append(
-                {"name": source.name, "weight": source.weight, "files": names, "rotating": rotating}
-            )
+            index["sources"].append({
+                "name": source.name, "weight": source.weight, "files": names, "names": list(source.names),
+                "rotating": rotating, "masks": _write_masks(file, names, source.masks),
+            })  # fmt: skip
         for number, sequence in enumerate(posed):
             names = [f"p{number}/{row}.webp" for row in range(len(sequence.pictures))]
             unit = max(float(values.max()) for values in sequence.inverse_depth) / _DEPTH_LEVELS or 1.0
@@ -56,6 +58,7 @@ def write_pack(
             index["posed"].append({
                 "name": sequence.name, "files": names, "unit": unit, "times": sequence.times.tolist(),
                 "K": sequence.K.tolist(), "world_from_cam": sequence.world_from_cam.tolist(),
+                "weight": sequence.weight, "masks": _write_masks(file, names, sequence.masks),
             })  # fmt: skip
         file.writestr(_INDEX, json.dumps(index))
 
@@ -83,8 +86,8 @@ def _unpacked(
         sources = tuple(
             Source(
                 entry["name"], tuple(pool.map(_grey, (content[name] for name in entry["files"]))),
-                tuple(entry["files"]), entry["weight"],
-                None if entry["rotating"] is None else np.array(entry["rotating"]),
+                tuple(entry.get("names", entry["files"])), entry["weight"],
+                None if entry["rotating"] is None else np.array(entry["rotating"]), _masks(content, entry),
             )
             for entry in index["sources"]
         )  # fmt: skip
@@ -93,10 +96,15 @@ def _unpacked(
                 entry["name"], tuple(pool.map(_grey, (content[name] for name in entry["files"]))),
                 np.array(entry["times"]), np.array(entry["K"]), np.array(entry["world_from_cam"]),
                 tuple(_depths((content[f"{name}.png"] for name in entry["files"]), entry["unit"])),
+                entry.get("weight", 1.0), _masks(content, entry),
             )
             for entry in index["posed"]
         ]  # fmt: skip
-    return Pictures(sources), posed, tuple(DataSource(**entry) for entry in index["data"])
+    return (
+        Pictures(sources, tuple(index.get("skipped", ()))),
+        posed,
+        tuple(DataSource(**entry) for entry in index["data"]),
+    )
 
 
 def _webp(picture: UInt8, quality: int) -> bytes:
@@ -106,6 +114,18 @@ def _webp(picture: UInt8, quality: int) -> bytes:
 def _encoded(suffix: str, image: np.ndarray, level: int) -> bytes:
     flag = cv2.IMWRITE_WEBP_QUALITY if suffix == ".webp" else cv2.IMWRITE_PNG_COMPRESSION
     return bytes(cv2.imencode(suffix, image, [flag, level])[1].tobytes())
+
+
+def _write_masks(file: zipfile.ZipFile, names: list[str], masks: Sequence[Mask]) -> bool:
+    """Masks beside their pictures; whether there are any. Packs of earlier versions have none."""
+    for name, mask in zip(names, masks, strict=bool(masks)):
+        file.writestr(f"{name}.mask.png", _encoded(".png", mask.astype(np.uint8) * 255, 9))
+    return bool(masks)
+
+
+def _masks(content: dict[str, bytes], entry: dict[str, Any]) -> tuple[Mask, ...]:
+    names = entry["files"] if entry.get("masks") else ()
+    return tuple(_grey(content[f"{name}.mask.png"]) > 0 for name in names)
 
 
 def _grey(content: bytes) -> UInt8:

@@ -167,7 +167,10 @@ class PairPoints:
         there = warped(plan.view_from_picture[len(plan.rows) :], in_b)
         size = on_device(np.array([plan.size], np.float32), there.device)
         margin = self.settings.masked_pixels
-        return known & ~within(there + margin, size + 2 * margin)
+        absent = ~within(there + margin, size + 2 * margin)
+        if posed is not None:
+            absent[: plan.posed] |= ~posed.carried.ahead  # behind the camera, wherever a homography takes that
+        return known & absent
 
     def _in_pictures(self, plan: PairPlan, points: Tensor) -> _InPictures:
         """Where pixels of view a (B, N, 2) are in the pictures."""

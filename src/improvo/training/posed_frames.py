@@ -11,6 +11,7 @@ from torch import Tensor
 
 from improvo.training.picture_store import DepthStore, on_device
 from improvo.training.posed import PosedSequence
+from improvo.training.view_points import FAR
 from improvo.types import Float64, Int64
 
 _SIDE = 3.0  # pixels from a place to those that tell how the surface about it is seen
@@ -65,7 +66,7 @@ class PosedFrames:
         seen = (seen[:, :, None] * A[:, None]).sum(dim=-1) + inverse[..., None] * t[:, None]  # over the depth in a
         ahead = (inverse > 0) & (seen[..., 2] > 1e-3)
         depth = torch.where(ahead, seen[..., 2], 1.0)
-        places = torch.where(ahead[..., None], seen[..., :2] / depth[..., None], -1.0)
+        places = torch.where(ahead[..., None], seen[..., :2] / depth[..., None], FAR)
         return Carried(places, inverse / depth, ahead)
 
     def shown(self, rows: Int64, carried: Carried, tolerance: float) -> Tensor:

@@ -37,5 +37,9 @@ class SeededBatches:
     def generators(self, step: int) -> list[np.random.Generator]:
         """A random generator for each element of a batch that this process makes."""
         cv2.setNumThreads(0)  # processes make batches at the same time
-        seed, own = self._optimiser.seed, self.process.part_of(self._optimiser.batch_size)
-        return [np.random.default_rng([seed, step, number]) for number in own]
+        return [np.random.default_rng([self._optimiser.seed, step, number]) for number in self.numbers]
+
+    @property
+    def numbers(self) -> range:
+        """The numbers within the whole batch, of all processes, of the elements that this process makes."""
+        return self.process.part_of(self._optimiser.batch_size)

@@ -125,9 +125,8 @@ class AdaptationSettings:
     keypoints_per_view: int = 300
     border: int = 3  # pixels along the edge of a view that count for nothing
     suppression: int = 4  # pixels, radius of non-maximum suppression on the consensus
-    # share of the views in which a point must be found again to be a label, and above which it is left undecided
-    accepted: float = 0.3
-    undecided: float = 0.15
+    accepted: float = 0.3  # a point that so large a share of the views finds again is a label
+    undecided: float = 0.15  # from this share up to `accepted` it is neither label nor background
 
     def __post_init__(self) -> None:
         checks = Checks(self, "adaptation")
@@ -177,7 +176,6 @@ class ShapesSettings:
     optimiser: OptimiserSettings = field(default_factory=lambda: OptimiserSettings(batch_size=32))
     views: ViewSettings = field(default_factory=ViewSettings)
     photometric: PhotometricSettings = field(default_factory=PhotometricSettings)
-    adaptation: AdaptationSettings = field(default_factory=AdaptationSettings)
 
     def __post_init__(self) -> None:
         Checks(self).choice("architecture", ARCHITECTURES)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +27,7 @@ from improvo.training.stage import Stage
 from improvo.training.trainer import Batches, Trainer
 
 WEIGHTS = "weights.safetensors"
+_NOT_STATED = "not stated"  # as the licence of data
 SETTINGS = "settings.yaml"
 StageSettings = ShapesSettings | HomographiesSettings | OdometryTrainingSettings | HeldSettings
 # what a continued run may change: none of these alters a step that was already made
@@ -102,7 +104,7 @@ def model_card(
     stage: str,
     settings: StageSettings,
     data: tuple[DataSource, ...],
-    parent: str,
+    start: Path | None,
 ) -> ModelCard:
     """The card of weights without a stability head, as far as it is known before training.
 
@@ -110,16 +112,17 @@ def model_card(
         architecture: that the weights are saved as.
         stage: `shapes`, `homographies`, `odometry` or `held`.
         settings: of the stage.
-        data: that is trained on.
-        parent: name of the weights that are started from; empty for random ones.
+        data: that is trained on; the card also names all that the weights had learned from before.
+        start: weights that are started from; None for random ones.
     """
     return ModelCard(
         architecture=architecture,
         licence="Apache-2.0",
-        data=data,
+        data=learned_from(load_weights(start).card.data if start else (), data),
         training={
             "stage": stage,
-            "start": parent or "random",
+            "start": start.name if start else "random",
+            "start_sha256": hashlib.sha256(start.read_bytes()).hexdigest() if start else "",
             "stability_trained": False,
             "seed": settings.optimiser.seed,
             "settings": config.to_dict(settings),
@@ -128,6 +131,23 @@ def model_card(
         commit=commit_of_code(),
         notes="The stability head is not part of these weights: only VO adaptation can teach it.",
     )
+
+
+def not_stated(names: Iterable[str]) -> tuple[DataSource, ...]:
+    """Data of which nobody said the licence."""
+    return tuple(DataSource(name, _NOT_STATED) for name in names)
+
+
+def learned_from(before: tuple[DataSource, ...], now: tuple[DataSource, ...]) -> tuple[DataSource, ...]:
+    """All that weights have seen, each source once; what is not stated now may have been before.
+
+    Args:
+        before: of the weights that were started from.
+        now: of this training.
+    """
+    known = {source.name: source for source in before}
+    stated = [known.get(each.name, each) if each.licence == _NOT_STATED else each for each in now]
+    return tuple({each.name: each for each in (*stated, *(each for each in before if each not in stated))}.values())
 
 
 def commit_of_code() -> str:

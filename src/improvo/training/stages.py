@@ -18,7 +18,7 @@ from improvo.training.networks import first_network, published_architecture, sta
 from improvo.training.pairs import PairBatches
 from improvo.training.pictures import Pictures, load_pictures
 from improvo.training.settings import HomographiesSettings, OdometryTrainingSettings, ShapesSettings
-from improvo.training.stage_folder import model_card, run_stage, stage_folder
+from improvo.training.stage_folder import model_card, not_stated, run_stage, stage_folder
 from improvo.training.superpoint_stages import JointStage, MagicPointStage
 from improvo.training.synthetic import ShapeBatches, shape_source
 from improvo.training.trainer import choose_device
@@ -45,8 +45,8 @@ def train_shapes(
     Returns:
         The last row of metrics.
     """
-    network, parent = first_network(settings.architecture, settings.optimiser.seed, start)
-    card = model_card(published_architecture(settings.architecture), "shapes", settings, (SHAPES,), parent)
+    network = first_network(settings.architecture, settings.optimiser.seed, start)
+    card = model_card(published_architecture(settings.architecture), "shapes", settings, (SHAPES,), start)
     stage = MagicPointStage(network, settings.detector)
     return run_stage(stage, ShapeBatches(settings), settings, output, card, progress)
 
@@ -82,18 +82,18 @@ def train_homographies(
     pictures = load_pictures(sources, settings.longer_side, progress)
     on_pictures(pictures)
     seed = settings.optimiser.seed
-    network, parent = first_network(settings.architecture, seed, start, settings.stem_channels)
+    network = first_network(settings.architecture, seed, start, settings.stem_channels)
     with stage_folder(output, "homographies"):
         labels = _labels(pictures, settings, output, detector, progress)
         if not data:
-            data = tuple(DataSource(source.name, "not stated") for source in pictures.sources)
+            data = not_stated(source.name for source in pictures.sources)
         if settings.shapes:
             weight = settings.shapes_share / (1 - settings.shapes_share) * sum(s.weight for s in pictures.sources)
             source, drawn = shape_source(settings.shapes, seed, weight)
             pictures = replace(pictures, sources=(*pictures.sources, source))
             labels, data = [*labels, drawn], (*data, SHAPES)
         architecture = published_architecture(settings.architecture)
-        card = model_card(architecture, "homographies", settings, data, parent)
+        card = model_card(architecture, "homographies", settings, data, start)
         card.training.update(
             detector_labels=detector.name if detector else "shi-tomasi",
             pictures=len(pictures),
@@ -154,9 +154,9 @@ def train_odometry(
                 "pairs.least_points"
             )
         if not data:
-            data = tuple(DataSource(name, "not stated") for name in (*(s.name for s in sequences), *sources))
+            data = not_stated((*(s.name for s in sequences), *sources))
         published = replace(parent.architecture, stability=True)
-        card = model_card(published, "odometry", settings, data, start.name)
+        card = model_card(published, "odometry", settings, data, start)
         card.training.update(
             stability_trained=True,
             sequences=len(sequences),

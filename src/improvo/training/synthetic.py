@@ -9,11 +9,12 @@ from improvo.training.labels import PointLabels, label_cells
 from improvo.training.photometric import augment
 from improvo.training.pictures import Source
 from improvo.training.seeded_batches import Batch, SeededBatches
-from improvo.training.settings import ShapesSettings
+from improvo.training.settings import AdaptationSettings, ShapesSettings
 from improvo.training.shapes import FAMILIES, draw_shape
 from improvo.training.views import random_view, warp_image, warp_points
 
 SIZE = (320, 240)  # width, height of the drawn pictures
+_EXACT = AdaptationSettings()  # a drawn corner is a label whatever share of views would be asked for
 
 
 def shape_source(count: int, seed: int, weight: float) -> tuple[Source, list[PointLabels]]:
@@ -53,5 +54,5 @@ class ShapeBatches(SeededBatches):
             visible = cv2.warpPerspective(np.ones_like(picture), H, (width, height), flags=cv2.INTER_NEAREST) > 0
             agreement = np.ones(len(points), np.float32)
             seen = warp_points(H, points)
-            cells.append(label_cells(seen, agreement, visible, width, height, settings.adaptation))
+            cells.append(label_cells(seen, agreement, visible, width, height, _EXACT))
         return {"images": np.stack(images)[:, None], "cells": np.stack(cells)}

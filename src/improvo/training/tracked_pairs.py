@@ -80,10 +80,14 @@ class TrackedPairs(SeededBatches):
         self.stable_per_unstable = float(stable / max(unstable, 1))
 
     def __getitem__(self, step: int) -> Batch:
-        seed = self.settings.optimiser.seed
+        optimiser, own = self.settings.optimiser, self.numbers
         pairs = [self._pair(rng) for rng in self.generators(step)]
         views = [pair[0] for pair in pairs] + [pair[1] for pair in pairs]
-        taught = [self._stability(np.random.default_rng([seed, step, n, 1]), view) for n, view in enumerate(views)]
+        numbers = [*own, *(optimiser.batch_size + number for number in own)]  # of the views of the whole batch
+        taught = [
+            self._stability(np.random.default_rng([optimiser.seed, step, number, 1]), view)
+            for number, view in zip(numbers, views, strict=True)
+        ]
         return {
             "images": np.stack([view.image for view in views])[:, None],
             "cells": np.stack([view.cells for view in views]),

@@ -10,6 +10,8 @@ from improvo.training.labels import DUSTBIN
 from improvo.training.picture_store import on_device
 from improvo.types import Float64
 
+FAR = -1e6  # pixels, in place of a place that no picture shows: behind the camera, or beyond the horizon
+
 
 def cell_corners(rows: int, columns: int, device: torch.device) -> Tensor:
     """(C, 2) the top left pixels of the cells, row by row."""
@@ -37,7 +39,7 @@ def warped(H: Float64, points: Tensor) -> Tensor:
     seen = torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
     seen = (seen[:, :, None] * matrix[:, None]).sum(dim=-1)  # in full precision whatever a product may use
     depth = seen[..., 2:]
-    return torch.where(depth > 1e-6, seen[..., :2] / depth.clamp(min=1e-6), -1e6)
+    return torch.where(depth > 1e-6, seen[..., :2] / depth.clamp(min=1e-6), FAR)
 
 
 def within(points: Tensor, sizes: Tensor) -> Tensor:

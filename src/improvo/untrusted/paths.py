@@ -20,6 +20,11 @@ def is_text(path: Path) -> bool:
     return True
 
 
+def as_text(name: str) -> str:
+    """A name for titles: what is no text becomes a question mark in a diamond, which fonts and tables can show."""
+    return "".join("\N{REPLACEMENT CHARACTER}" if 0xD800 <= ord(each) <= 0xDFFF else each for each in name)
+
+
 def check_path(path: Path) -> Path:
     """The path, if the system can look it up; whether something is there does not matter.
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.evaluation.settings import HomographySettings
+from improvo.frontend.architecture import CELL
 from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.images import read_grey
 from improvo.training.settings import ViewSettings
@@ -97,11 +98,17 @@ def open_scene(scene: Scene, settings: HomographySettings) -> tuple[UInt8, list[
 
 
 def _random_views(scene: Scene, reference: UInt8, settings: HomographySettings) -> list[View]:
-    height, width = reference.shape
+    size = (reference.shape[1], reference.shape[0])
+    # a view's sides are multiples of a network's cell
+    height, width = (side // CELL * CELL for side in reference.shape)
+    if min(height, width) < 2 * CELL:
+        raise InputError(
+            f"{scene.reference}: is {size[0]}x{size[1]} pixels; give pictures of {2 * CELL}x{2 * CELL} or more"
+        )
     rng = np.random.default_rng([settings.seed, zlib.crc32(scene.name.encode())])
     shape = ViewSettings(height=height, width=width, smallest_zoom=0.7, largest_zoom=1.1)
-    middle = np.array([width - 1, height - 1]) / 2.0
-    homographies = [random_view(rng, shape, (width, height), middle) for _ in range(settings.views)]
+    middle = np.array([size[0] - 1, size[1] - 1]) / 2.0
+    homographies = [random_view(rng, shape, size, middle) for _ in range(settings.views)]
     return [View(warp_image(reference, H, width, height), np.asarray(H, np.float64)) for H in homographies]
 
 

@@ -15,7 +15,7 @@ from improvo.config import to_dict
 from improvo.evaluation.homography.pairs import Scene, open_scene
 from improvo.evaluation.measures import squared_distances
 from improvo.evaluation.settings import HomographySettings
-from improvo.evaluation.sources import LoadedFrontend
+from improvo.evaluation.sources import LoadedFrontend, refuse_equal_names
 from improvo.evaluation.statistics import Bootstrap, average_precision
 from improvo.evaluation.tables import bold_best, columns_to_rows, decimals, markdown
 from improvo.jobs.pool import Workers
@@ -167,7 +167,9 @@ def run_homography_protocol(
 
     Raises:
         InputError: an image or homography that cannot be read.
+        ConfigError: two frontends of one label.
     """
+    refuse_equal_names("frontends", [frontend.label for frontend in frontends])
     tasks = [HomographyTask(scene, tuple(frontends), settings) for scene in scenes]
     pairs = [row for rows in (workers or Workers()).run(evaluate_scene, tasks, "homography") for row in rows]
     splits = ["all", *sorted({scene.split for scene in scenes})]
@@ -203,7 +205,7 @@ def _summary(pairs: list[dict[str, Any]], settings: HomographySettings) -> dict[
 def homography_table(results: dict[str, Any]) -> str:
     """`homography.json` as Markdown, one table per split."""
     limits = [f"homography_{limit:g}px" for limit in results["settings"]["corner_errors_px"]]
-    parts = []
+    parts, skipped = [], results.get("skipped_frontends", ())
     for split in dict.fromkeys(row["split"] for row in results["rows"]):
         rows = [row for row in results["rows"] if row["split"] == split]
         header = [f"{split}: {rows[0]['pairs']} pairs", "repeatab.", "localis. (px)", "mAP", "matching"]
@@ -214,4 +216,5 @@ def homography_table(results: dict[str, Any]) -> str:
             cells = [decimals(value) for value in values]
             columns.append(bold_best(cells, values, largest=field != "localisation_error"))
         parts.append(markdown(header, columns_to_rows([row["frontend"] for row in rows], columns)))
+    parts += ["\n".join(f"- frontend {s['frontend']} not run: {s['reason']}" for s in skipped)] if skipped else []
     return "\n\n".join(parts) + "\n"

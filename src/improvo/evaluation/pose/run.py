@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from improvo.errors import ConfigError
 from improvo.evaluation.pose.cache import read_cache, write_cache
 from improvo.evaluation.pose.pairs import SequencePairs, pairs_of_sequence, refuse_empty_gaps
 from improvo.evaluation.pose.protocol import ExtractionTask, Records, evaluate_pairs, extract, pair_tasks
 from improvo.evaluation.settings import PoseSettings
-from improvo.evaluation.sources import FeatureSource, SequenceSource, sequence_fingerprint
+from improvo.evaluation.sources import (
+    FeatureSource,
+    SequenceSource,
+    file_name,
+    refuse_equal_names,
+    sequence_fingerprint,
+)
 from improvo.jobs.pool import Workers
 from improvo.types import Features
 
@@ -51,10 +55,8 @@ def run_pose_protocol(
         InputError: a sequence without depth or poses, a gap without pairs, a cache made with other settings.
         ConfigError: two frontends or sequences of one name.
     """
-    for what, labels in (("frontends", [f.label for f in frontends]), ("sequences", [s.open().name for s in sources])):
-        twice = {label for label in labels if labels.count(label) > 1}
-        if twice or not labels:
-            raise ConfigError(f"{what}: `{min(twice)}` is given twice" if twice else f"no {what} given")
+    refuse_equal_names("frontends", [frontend.label for frontend in frontends])
+    refuse_equal_names("sequences", [source.open().name for source in sources])
     workers = workers or Workers()
     sequences = list(workers.run(_draw, [(source, settings) for source in sources], "pairs"))
     refuse_empty_gaps(sequences, settings.gaps)
@@ -104,8 +106,3 @@ def _features_of(
             write_cache(folder, fingerprint, features)
         folders.append(folder)
     return folders, tuple(sorted(unreadable))
-
-
-def file_name(label: str) -> str:
-    """A label as the name of a folder."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", label).strip(".") or "_"

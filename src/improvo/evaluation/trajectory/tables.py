@@ -109,6 +109,7 @@ def vo_tables(results: dict[str, Any]) -> str:
         f"- {row['sequence']}, {row['frontend']}: {row['note']}" for row in results["sequence_rows"] if row["note"]
     ]
     notes += [f"- {entry['sequence']} left out: {entry['reason']}" for entry in results["excluded"]]
+    notes += [f"- frontend {s['frontend']} not run: {s['reason']}" for s in results.get("skipped_frontends", ())]
     notes += [
         f"- {row['frontend']} has no stability head: all weights are 1" for row in results["rows"] if not row["variant"]
     ]

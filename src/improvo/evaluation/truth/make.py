@@ -24,6 +24,7 @@ from improvo.evaluation.truth.structure_from_motion import (
     reconstruct,
 )
 from improvo.files import make_output_folder, write_json
+from improvo.folder_lock import locked
 from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import inverse
 from improvo.sequences import Sequence
@@ -108,6 +109,7 @@ def make_truth(
 
     Raises:
         InputError: no reconstruction, no depth, or a quality below the limits.
+        BusyError: another process works on the same output.
         MissingExtraError: without `pycolmap`.
     """
     if sequence.settings.width is not None:
@@ -116,8 +118,11 @@ def make_truth(
     if model is not None:
         found = read_reconstruction(model)
     else:
-        folder = _working_folder(output, sequence, settings)
-        found = reconstruct(sequence, folder, settings, threads, progress)
+        folder = output.with_suffix(".work")
+        make_output_folder(folder, COMMAND)
+        with locked(folder):  # two in one database would spoil each other's
+            _check_request(folder, sequence, settings)
+            found = reconstruct(sequence, folder, settings, threads, progress)
     names = tuple(image.name for image in found.images)
     world_from_cam = inverse(np.stack([image.cam_from_world for image in found.images]))
     frames = frames_of(ReferencePoses(str(model or sequence.path), world_from_cam, names=names), sequence.recording)
@@ -150,10 +155,8 @@ def _aspect(camera: Camera) -> float:
     return camera.fy / camera.fx
 
 
-def _working_folder(output: Path, sequence: Sequence, settings: TruthSettings) -> Path:
-    """The working folder; one that was made with other frames or settings is refused."""
-    folder = output.with_suffix(".work")
-    make_output_folder(folder, COMMAND)
+def _check_request(folder: Path, sequence: Sequence, settings: TruthSettings) -> None:
+    """Refuse a working folder that was made with other frames or settings."""
     mask = sequence.raw_mask(0)
     wanted: dict[str, Any] = {
         "recording": str(sequence.path.absolute()),
@@ -168,7 +171,6 @@ def _working_folder(output: Path, sequence: Sequence, settings: TruthSettings) -
     if request.is_file() and read_json_file(request, mend) != json.loads(json.dumps(wanted)):
         raise InputError(f"{folder}: was begun with other frames or settings; {mend}")
     write_json(request, wanted)
-    return folder
 
 
 def _scale(

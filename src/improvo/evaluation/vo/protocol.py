@@ -10,7 +10,7 @@ import numpy as np
 from improvo.config import to_dict
 from improvo.errors import InputError
 from improvo.evaluation.settings import TrajectorySettings
-from improvo.evaluation.sources import Recorded
+from improvo.evaluation.sources import LoadedFrontend, Recorded, refuse_equal_names
 from improvo.evaluation.trajectory.protocol import AlignedSegment, aligned_segments, clean_truth, errors_over_windows
 from improvo.evaluation.trajectory.protocol import evaluate_trajectory as evaluate
 from improvo.frontend.masking import features_of
@@ -29,8 +29,7 @@ class VoTask:
     """One sequence and one frontend; its features serve both variants."""
 
     source: Recorded
-    frontend: str
-    max_keypoints: int
+    frontend: LoadedFrontend
     odometry: OdometrySettings
     trajectory: TrajectorySettings
 
@@ -64,7 +63,7 @@ def run_vo(task: VoTask) -> list[VoOutcome]:
         InputError: the sequence cannot be read.
     """
     sequence = task.source.open()
-    frontend = load_frontend(task.frontend, task.max_keypoints)
+    frontend = load_frontend(task.frontend.name, task.frontend.max_keypoints)  # as odometry uses it
     detected = [(frame.time, features_of(frontend, frame)) for frame in sequence]
     has_head = any(features.stability is not None for _, features in detected)
     outcomes = []
@@ -91,8 +90,7 @@ def _outcome(sequence: Sequence, task: VoTask, variant: str, frames: int, trajec
         errors = to_dict(evaluate(trajectory, truth, task.trajectory))
     except InputError as error:
         note = str(error) if len(trajectory) else "odometry found no pose"
-    label = task.frontend.rpartition("/")[2].removesuffix(".safetensors")
-    return VoOutcome(sequence.name, label, variant, frames, trajectory, segments, errors, note)
+    return VoOutcome(sequence.name, task.frontend.label, variant, frames, trajectory, segments, errors, note)
 
 
 def usable(sources: list[Recorded]) -> tuple[list[Recorded], list[ExcludedSequence]]:
@@ -124,8 +122,7 @@ def usable(sources: list[Recorded]) -> tuple[list[Recorded], list[ExcludedSequen
 
 def evaluate_vo(
     sources: list[Recorded],
-    frontends: list[str],
-    max_keypoints: int,
+    frontends: list[LoadedFrontend],
     odometry: OdometrySettings,
     settings: TrajectorySettings,
     workers: Workers | None = None,
@@ -134,17 +131,22 @@ def evaluate_vo(
 
     Args:
         sources: sequences with true poses; those with invalid ones are left out and named.
-        frontends: names or weights files.
-        max_keypoints: per frame.
+        frontends: with different labels; ours alone, as odometry uses them.
         odometry: settings of the odometry.
         settings: of the comparison; windows by share of the path are left to the single sequences.
         workers: processes; by default this one alone.
 
     Returns:
         The single outcomes, and the content of `vo.json`: `rows` pool the windows of all sequences.
+
+    Raises:
+        InputError: a sequence without any true pose, or none that can be used.
+        ConfigError: two frontends or sequences of one name.
     """
+    refuse_equal_names("frontends", [frontend.label for frontend in frontends])
+    refuse_equal_names("sequences", [source.open().name for source in sources])
     chosen, excluded = usable(sources)
-    tasks = [VoTask(source, name, max_keypoints, odometry, settings) for source in chosen for name in frontends]
+    tasks = [VoTask(source, frontend, odometry, settings) for source in chosen for frontend in frontends]
     outcomes = [outcome for found in (workers or Workers()).run(run_vo, tasks, "odometry") for outcome in found]
     pooled = replace(settings, path_fractions=())
     rows = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from dataclasses import replace
 
+from improvo.errors import InputError
 from improvo.geometry.camera_files.calibration import Calibration, Four, checked, four
 
 # model -> its number in `cameras.bin`, and how many parameters it has (COLMAP's documentation, "Camera Models")
@@ -26,7 +27,7 @@ Row = tuple[str, Calibration]
 
 
 def from_text(rows: list[list[str]], source: str, wanted: str | None) -> Calibration:
-    """The wanted camera of `cameras.txt`, the first without; the others are its alternatives.
+    """The wanted camera of `cameras.txt`, the first without; the others are its alternatives, if they can be used.
 
     Args:
         rows: fields of the lines that are no comments.
@@ -44,8 +45,12 @@ def from_text(rows: list[list[str]], source: str, wanted: str | None) -> Calibra
         if wanted is not None and number != wanted:
             found.append((number, Calibration(source, (1, 1, 0, 0))))
             continue
-        values = [float(value) for value in parameters]
-        found.append((number, colmap_calibration(source, model, (int(width), int(height)), values)))
+        try:
+            values = [float(value) for value in parameters]
+            found.append((number, colmap_calibration(source, model, (int(width), int(height)), values)))
+        except (ValueError, InputError):
+            if wanted is not None or not found:
+                raise
     return _chosen(found, wanted)
 
 
@@ -62,15 +67,21 @@ def from_binary(data: bytes, source: str, wanted: str | None) -> Calibration:
         offset = 8
         for _ in range(count):
             camera, model, width, height = struct.unpack_from("<iiQQ", data, offset)
-            if model not in names:
+            if model not in names:  # how long its row is, and so where the next one begins, is not known
+                if any(wanted in (None, number) for number, _ in found):
+                    break
                 raise ValueError(f"COLMAP model number {model} is not supported; known: {', '.join(MODELS)}")
             name, parameters = names[model]
             values = list(struct.unpack_from(f"<{parameters}d", data, offset + 24))
             offset += 24 + 8 * parameters
-            if wanted is None or str(camera) == wanted:
-                found.append((str(camera), colmap_calibration(source, name, (width, height), values)))
-            else:
+            if wanted is not None and str(camera) != wanted:
                 found.append((str(camera), Calibration(source, (1, 1, 0, 0))))
+                continue
+            try:
+                found.append((str(camera), colmap_calibration(source, name, (width, height), values)))
+            except (ValueError, InputError):
+                if wanted is not None or not found:
+                    raise
     except struct.error:
         raise ValueError("is no COLMAP cameras.bin, or is cut short") from None
     return _chosen(found, wanted)

@@ -44,6 +44,8 @@ class Keys:
         self._values: dict[str, tuple[str, Any]] = {}
         self._read: set[str] = set()
         for key, value in values:
+            if re.fullmatch(r"p\d", normalised(key)) and _is_projection(value):
+                continue  # of a stereo pair; the coefficients p1 and p2 may stand beside it
             self._values[normalised(key)] = (str(key), value)
 
     def __contains__(self, name: str) -> bool:
@@ -152,6 +154,14 @@ def numbers(value: Any, key: str) -> tuple[float, ...]:
     for item in value:
         flat += numbers(item, key) if isinstance(item, list | tuple) else [number(item, key)]
     return tuple(flat)
+
+
+def _is_projection(value: Any) -> bool:
+    """Whether this is a matrix (3, 4)."""
+    try:
+        return isinstance(value, list | tuple | dict) and len(numbers(value, "")) == 12
+    except ValueError:
+        return False
 
 
 def is_value(value: Any) -> bool:

@@ -19,7 +19,12 @@ _DSO_MODELS = {
     "fov": (5, "fov"),
     "atan": (5, "fov"),
 }
-_KITTI_ROW = re.compile(r"^\s*(P\d|P_rect_\d\d|K_\d\d|Tr|R0_rect|calib_time)\s*:", re.MULTILINE)
+# 12 or 9 bare numbers; OpenCV's files of a stereo pair have rows P1 and P2 too, but as matrices of YAML
+_KITTI_ROW = re.compile(
+    r"^[ \t]*(P\d|P_rect_\d\d|K_\d\d|Tr|R0_rect)[ \t]*:([ \t]+[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?){9,12}[ \t\r]*$",
+    re.MULTILINE,
+)
+_YAML = re.compile(r"[][{}]|!!|^%YAML", re.MULTILINE)
 
 
 def is_plain(text: str) -> bool:
@@ -27,7 +32,7 @@ def is_plain(text: str) -> bool:
     rows = _rows(text)
     if not rows:
         return False
-    if _KITTI_ROW.search(text):
+    if _is_kitti(text):
         return True
     first = rows[0]
     if first[0].lower() in _DSO_MODELS and len(first) > 4:
@@ -35,6 +40,10 @@ def is_plain(text: str) -> bool:
     if len(first) > 4 and re.fullmatch(r"[A-Z_]{3,}", first[1]) and first[0].isdecimal():
         return True
     return all(is_number(field) for field in first)
+
+
+def _is_kitti(text: str) -> bool:
+    return _YAML.search(text) is None and _KITTI_ROW.search(text) is not None
 
 
 def from_plain_text(text: str, source: str, wanted: str | None) -> Calibration:
@@ -49,7 +58,7 @@ def from_plain_text(text: str, source: str, wanted: str | None) -> Calibration:
         ValueError: none of these notations, or a value that cannot be.
     """
     rows = _rows(text)
-    if _KITTI_ROW.search(text):
+    if _is_kitti(text):
         return kitti(text, source, wanted)
     if rows and len(rows[0]) > 1 and re.fullmatch(r"[A-Z_]{3,}", rows[0][1]):
         return colmap.from_text(rows, source, wanted)

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
+from improvo.errors import InputError
 from improvo.geometry.camera_files.calibration import Calibration, checked
 from improvo.geometry.camera_files.distortion import normalised
 from improvo.geometry.camera_files.foreign import translated
@@ -50,7 +51,7 @@ def cameras(tree: Any, source: str, wanted: str | None) -> Calibration:
     for name, pairs in found[1:]:
         try:
             others.append(checked(one_camera(Keys(pairs), f"{source}#{name}")))
-        except (KeyError, ValueError):  # noqa: PERF203 - only the camera that is used must be understood
+        except (KeyError, ValueError, InputError):  # noqa: PERF203 - only the camera that is used must be understood
             continue
     alternatives = tuple(other for other in others if other.size is not None)
     return checked(_with_alternatives(first, alternatives))

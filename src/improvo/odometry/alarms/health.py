@@ -27,6 +27,7 @@ from improvo.types import Int64
 _GAPS = (3, 6, 12)  # frames between the two views of a check
 _ROUNDS = 3  # consecutive checks that are evaluated together
 _AGREEMENT = 0.85  # share of the two views' own inliers that fit the map: right maps stay over 0.90, wrong under 0.80
+_TRACKED_AGREEMENT = 0.95  # of those that are tracked, too: so many speak for the map, whatever the others agree on
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,9 @@ class Agreement:
     matches: int
     turn_deg: float = 0.0  # between the rotations of both poses
     two_motions: bool = False  # each is supported by matches that are far off the other; the check decides nothing
+    # Of the inliers, those whose track leads from the one view to the other, frame by frame.
+    map_tracked: int = 0
+    own_tracked: int = 0
 
 
 class HealthCheck:
@@ -56,7 +60,7 @@ class HealthCheck:
         self._camera = camera
         self._settings = settings
         self._descriptor_distance = descriptor_distance
-        self._rounds: deque[Int64] = deque(maxlen=_ROUNDS)  # of (gaps, 2) map and own inliers
+        self._rounds: deque[Int64] = deque(maxlen=_ROUNDS)  # of (gaps, 4) map and own inliers, all and tracked
         self._two_motions = 0  # checks in a row that saw two
 
     def contradicts(self, view: View, earlier: Mapping[int, View]) -> bool:
@@ -68,7 +72,7 @@ class HealthCheck:
         """
         if view.frame_index % STEP_FRAMES:
             return False
-        counts = np.zeros((len(_GAPS), 2), np.int64)
+        counts = np.zeros((len(_GAPS), 4), np.int64)
         two_motions = False
         for row, gap in enumerate(_GAPS):
             if view.frame_index - gap not in earlier:
@@ -77,16 +81,35 @@ class HealthCheck:
                 earlier[view.frame_index - gap], view, self._camera, self._descriptor_distance, self._settings
             )
             two_motions |= found.two_motions
-            enough = found.own_inliers >= max(self._settings.start.min_points, LARGE_PART * found.matches)
-            if enough and found.turn_deg < SAME_TURN_DEG and not found.two_motions:
-                counts[row] = found.map_inliers, found.own_inliers
+            if found.two_motions or not self._credible(found):
+                continue
+            counts[row] = found.map_inliers, found.own_inliers, found.map_tracked, found.own_tracked
         self._rounds.append(counts)
         self._two_motions = self._two_motions + 1 if two_motions else 0
         if len(self._rounds) < _ROUNDS:
             return False
-        map_inliers, own_inliers = np.sum(self._rounds, axis=(0, 1))
+        map_inliers, own_inliers, map_tracked, own_tracked = np.sum(self._rounds, axis=(0, 1))
         decides = own_inliers >= _ROUNDS * self._settings.start.min_points
-        return bool(decides and map_inliers < _AGREEMENT * own_inliers)
+        # A wall of repeated texture, matched one repetition off, moves rigidly, too; tracks seldom make that mistake.
+        confirmed = map_tracked >= max(self._settings.start.min_points, _TRACKED_AGREEMENT * own_tracked)
+        return bool(decides and map_inliers < _AGREEMENT * own_inliers and not confirmed)
+
+    def _credible(self, found: Agreement) -> bool:
+        """Whether enough matches agree with the two views' own pose for it to say something of the map.
+
+        One that turned far otherwise comes from repeated texture or a crowd more often than from a wrong map. It
+        counts where most matches agree with it, and tracks do, too, rather than with the map.
+        """
+        least = self._settings.start.min_points
+        if found.turn_deg < SAME_TURN_DEG:
+            return found.own_inliers >= max(least, LARGE_PART * found.matches)
+        most = found.own_inliers >= (1.0 - LARGE_PART) * found.matches
+        return most and found.own_tracked >= least and found.map_tracked < _AGREEMENT * found.own_tracked
+
+    @property
+    def has_judged(self) -> bool:
+        """Whether there were checks enough to say that a map is wrong."""
+        return len(self._rounds) == _ROUNDS
 
     @property
     def ambiguous(self) -> bool:
@@ -125,4 +148,7 @@ def agreement(a: View, b: View, camera: Camera, descriptor_distance: float, sett
     fits_own[used] = own.inliers  # which also lie in front of both
     two_motions = holds_beside(map_errors, own_errors, pixels_b, camera, limit)
     turn = float(se3.rotation_angle_deg((of_map[:3, :3].T @ own.pose[:3, :3])[None])[0])
-    return Agreement(int((map_errors < limit).sum()), int(fits_own.sum()), len(matches), turn, two_motions)
+    fits_map = map_errors < limit
+    tracked = a.tracks[matches[:, 0]] == b.tracks[matches[:, 1]]
+    counts = (int(each.sum()) for each in (fits_map & tracked, fits_own & tracked))
+    return Agreement(int(fits_map.sum()), int(fits_own.sum()), len(matches), turn, two_motions, *counts)

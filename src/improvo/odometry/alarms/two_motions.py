@@ -46,11 +46,12 @@ def has_second_motion(
 
 
 def holds_beside(errors: Float64, errors_other: Float64, pixels: Float64, camera: Camera, tolerance: float) -> bool:
-    """Whether a motion is supported by matches that are far off another one, and the other by matches far off it.
+    """Whether two motions stand beside each other: each is supported by matches that are far off the other one.
 
     Args:
-        errors: (N,) pixels, of matches to the motion.
-        errors_other: (N,) to the other one; neither was chosen by what is far off the other.
+        errors: (N,) pixels, of all matches to the first motion.
+        errors_other: (N,) of all matches to the second. Neither motion may come from matches that were chosen because
+            they are far off the other.
         pixels: (N, 2) of the matches in one of the views.
         camera: gives the size of the picture.
         tolerance: pixels.

@@ -13,7 +13,7 @@ from improvo.geometry.triangulation import triangulate_tracks
 from improvo.odometry.alarms.two_motions import has_second_motion
 from improvo.odometry.gates import MIN_PARALLAX_DEG, gate
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.view import View, matches_of_world, ransac_pairs
+from improvo.odometry.view import View, common_tracks, matches_of_world, ransac_pairs
 from improvo.tracking.matching import match_units
 from improvo.types import Float64, Int64
 
@@ -50,7 +50,8 @@ def initial_pair(
     """Relative pose of two views by the five-point algorithm, or by the homography of a plane.
 
     Where a pure rotation explains the matches, or a homography explains about as many as the essential matrix does,
-    the translation would be noise, and all depths with it. Two cases are accepted all the same: enough points off the
+    the translation would be noise, and all depths with it; that is so, too, where a rotation explains the tracks, and
+    only matches that are made afresh say otherwise. Two cases are accepted all the same: enough points off the
     plane, as in front of a wall; and a scene that is one plane, if its homography stands for a single motion.
 
     Args:
@@ -74,6 +75,8 @@ def initial_pair(
         return InitFailure("too few matches agree on a motion")
     if np.median(rotation_residuals(camera, pixels_a[inliers], pixels_b[inliers])) < gate(strict):
         return InitFailure("too little parallax: a rotation explains the motion")
+    if _rotation_explains_tracks(a, b, camera, settings):
+        return InitFailure("too little parallax: a rotation explains the tracks")
     another = replace(ransac, max_iterations=1000)
     if has_second_motion(essential.pose, camera, pixels_a, pixels_b, another, _MAX_SECOND_MOTION):
         return InitFailure("two motions: one of them is not the camera's")
@@ -82,6 +85,20 @@ def initial_pair(
     if ratio > _MOSTLY and off_plane < 2 * least:
         return _from_plane(a, b, rows_a, rows_b, plane, camera, settings)
     return _with_points(a, b, rows_a[inliers], rows_b[inliers], essential.pose, camera, settings)
+
+
+def _rotation_explains_tracks(a: View, b: View, camera: Camera, settings: OdometrySettings) -> bool:
+    """Whether what was tracked from one view to the other moved as by a rotation.
+
+    A wall of repeated texture, matched one repetition off, looks as if the camera had moved; tracks, from frame to
+    frame, seldom make that mistake.
+    """
+    rows_a, rows_b = common_tracks(a, b)
+    world = ~(a.attached[rows_a] | b.attached[rows_b])
+    if world.sum() < settings.start.min_points:
+        return False
+    residuals = rotation_residuals(camera, a.keypoints[rows_a[world]], b.keypoints[rows_b[world]])
+    return bool(np.median(residuals) < gate(_STRICT * settings.tolerance))
 
 
 def _with_points(

@@ -38,7 +38,7 @@ class LocalMap:
     def __init__(self, camera: Camera, settings: OdometrySettings, descriptor_distance: float) -> None:
         self.camera = camera
         self.store = PointStore()
-        self.history: deque[View] = deque(maxlen=MEMORY_FRAMES)  # in order of processing
+        self.history: deque[View] = deque(maxlen=MEMORY_FRAMES)  # in order of processing, the newest last
         self._settings = settings
         self._descriptor_distance = descriptor_distance
         self.refiner = KeypointRefiner(camera, settings.tolerance)
@@ -49,6 +49,12 @@ class LocalMap:
         """The view is processed: its points were seen last in it."""
         self.store.last_seen[view.points[view.observed]] = view.frame_index
         self.history.append(view)
+
+    def remember_in_order(self, views: Iterable[View]) -> None:
+        """Views that were processed in any order count as seen one after the other, each once."""
+        self.history.clear()
+        for view in sorted(views, key=lambda view: view.frame_index):
+            self.remember(view)
 
     def localise(self, view: View, neighbour: View) -> tuple[int, float]:
         """Pose of a view from the map points that its tracks share with a neighbour: PnP, then search by projection.

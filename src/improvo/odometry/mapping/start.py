@@ -100,6 +100,7 @@ def _grow(
     report = adjust(rest, [first], store, K, OBJECTIVE, _PATIENT, max_error)
     if not report.mean_error <= settings.tolerance:
         return InitFailure("the first views do not fit together", costly=True)
+    local_map.remember_in_order(done)
     return None
 
 

@@ -27,11 +27,6 @@ class WindowReport:
     dropped: int  # observations over the maximal error or behind the camera
     iterations: int
 
-    @property
-    def inlier_share(self) -> float:
-        """Share of the observations that were kept."""
-        return self.kept / max(self.kept + self.dropped, 1)
-
 
 @dataclass(frozen=True)
 class _Observations:

@@ -73,15 +73,22 @@ def apply_scale(sequence: Sequence, run: Run, ask: Ask, settings: ScaleSettings)
 
 
 def segment_maps(trajectory: Trajectory, estimates: dict[int, ScaleEstimate]) -> dict[int, SegmentMap]:
-    """How each segment is scaled: about where it began, which is where the one before it ended."""
+    """How each segment is scaled: about where it began, which is where the camera was in the last frame before it.
+
+    That frame is of any earlier segment: one that is seen again later goes on behind the segments after it.
+    """
     maps: dict[int, SegmentMap] = {}
     factor = next(iter(estimates.values())).metres_per_unit
-    old = new = np.zeros(3)
-    for segment in [int(number) for number in np.unique(trajectory.segment) if number >= 0]:
+    posed = np.flatnonzero(trajectory.segment >= 0)
+    numbers = trajectory.segment[posed]
+    for place in np.sort(np.unique(numbers, return_index=True)[1]).tolist():  # the first frame of each
+        old = new = np.zeros(3)
+        if place > 0:
+            old = trajectory.camera_centers[posed[place - 1]]
+            new = maps[int(numbers[place - 1])].apply(old)
+        segment = int(numbers[place])
         factor = estimates[segment].metres_per_unit if segment in estimates else factor
         maps[segment] = SegmentMap(factor, old, new)
-        old = trajectory.camera_centers[np.flatnonzero(trajectory.segment == segment)[-1]]
-        new = maps[segment].apply(old)
     return maps
 
 

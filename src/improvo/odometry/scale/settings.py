@@ -33,6 +33,13 @@ class ScaleSettings:
             raise ConfigError(f"--scale {self.source}: unknown; give {USAGE}")
         if self.source in ("height", "marker") and self.metres is None:
             raise ConfigError(f"--scale {self.source}: needs METRES; give {USAGE}")
+        for name, sources in (("metres", ("height", "marker")), ("reference", ("truth",))):
+            if getattr(self, name) is not None and self.source not in sources:
+                raise ConfigError(
+                    f"scale.{name}: belongs to {' and '.join(sources)}, and --scale is {self.source}; give {USAGE}"
+                )
+        if self.marker_dictionary != "auto" and self.source != "marker":
+            raise ConfigError(f"scale.marker_dictionary: belongs to marker, and --scale is {self.source}")
         for metres in [*([self.metres] if self.metres is not None else []), *(each[2] for each in self.distances)]:
             if not 0 < metres < 1e6:
                 raise ConfigError(f"--scale {self.source}: {metres:g} m is no length; give a positive number of metres")

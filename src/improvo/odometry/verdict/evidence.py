@@ -22,6 +22,7 @@ from improvo.odometry.gates import SAME_SCALE
 from improvo.odometry.mapping.window import OBJECTIVE, SOLVER
 from improvo.odometry.verdict.evidence_window import EvidenceKeyframe, EvidenceWindow
 from improvo.odometry.verdict.lens_evidence import LensMeasure, measured_lens
+from improvo.odometry.verdict.shared_errors import shared_error
 from improvo.odometry.view import Mask, View
 from improvo.types import Float64, Int64
 
@@ -32,6 +33,7 @@ PARTS = (*QUARTERS, *HALVES)
 _WINDOW = 12  # keyframes that are adjusted together from each part of the evidence; half of them overlap
 _FEW = 8  # observations or common points; fewer determine nothing
 _THIN = 6  # points seen on both sides of a gap between two keyframes; fewer carry no scale across it
+_UNKNOWN_SCALE = float(np.log(2.0))  # where no point is, the scale of what follows may as well be half or double
 _HASH = 2654435761  # a multiplier of Knuth's, so that the halves of the points are no halves of time or place
 
 
@@ -41,13 +43,13 @@ class Spread:
 
     Attributes:
         error_percent: (PARTS,) root mean square distance of the keyframes' positions after Sim3, % of the path.
-        scale_steps: (L, PARTS) change of the logarithm of a part's scale across each of L links between windows.
+        scale_steps: (L, PARTS) change of the logarithm of a part's scale across each of L links between windows, and
+            across each gap that no point bridges.
         link_frames: (L, 2) first and last frame of the keyframes on both sides of each link.
         noise_px: of the observations, standard deviation of one coordinate; NaN where nothing was observed.
         width: of the picture in pixels.
-        fewest: observations that a keyframe has, at least.
-        keyframes: of the segment.
         lens: what the windows say of the focal length.
+        shared_px: of the residuals, what neighbours in the picture have in common (`shared_errors.py`).
     """
 
     error_percent: Float64
@@ -55,9 +57,8 @@ class Spread:
     link_frames: Int64
     noise_px: float
     width: int
-    fewest: int
-    keyframes: int
     lens: tuple[LensMeasure, ...] = ()
+    shared_px: float = 0.0
 
 
 @dataclass
@@ -94,12 +95,14 @@ class EvidenceCheck:
         self._overlap = 0
         self._paths = [_Path() for _ in PARTS]
         self._centers: list[Float64] = []  # of the segment itself, one per keyframe
+        self._frames: list[int] = []  # of each keyframe
+        self._across: dict[int, int] = {}  # points on both sides of the gap after a keyframe, by any window
         self._errors: list[float] = []  # pixels, median of each window
+        self._shared: list[float] = []  # pixels, of each window
         self._scale_steps: list[Float64] = []
         self._links: list[tuple[int, int]] = []
         self._lens: list[LensMeasure] = []
         self._lens_due = True  # every other window: those between them share half of their keyframes with each
-        self._fewest = np.iinfo(np.int64).max
 
     def add(self, view: View, cam_from_world: Float64, xyz: Float64) -> None:
         """The next keyframe is final.
@@ -115,7 +118,7 @@ class EvidenceCheck:
         )
         self._pending.append(keyframe)
         self._centers.append(se3.inverse(cam_from_world)[:3, 3])
-        self._fewest = min(self._fewest, len(rows))
+        self._frames.append(view.frame_index)
         if len(self._pending) == _WINDOW:
             self._solve_window(xyz)
 
@@ -133,6 +136,7 @@ class EvidenceCheck:
         if len(self._centers) < 3:
             return None
         own = np.stack(self._centers)
+        self._mark_empty_gaps(own)
         errors = [error_percent(np.stack(path.centers), own) for path in self._paths]
         return Spread(
             error_percent=np.array(errors),
@@ -140,22 +144,35 @@ class EvidenceCheck:
             link_frames=np.array(self._links, np.int64).reshape(-1, 2),
             noise_px=float(np.median(self._errors)) / 1.1774 if self._errors else float("nan"),
             width=self._camera.width,
-            fewest=int(self._fewest),
-            keyframes=len(self._centers),
             lens=tuple(self._lens),
+            shared_px=float(np.median(self._shared)) if self._shared else 0.0,
         )
+
+    def _mark_empty_gaps(self, centers: Float64) -> None:
+        """Gaps that no point bridges: the scale of the shorter side is unknown, and so is the step between the two."""
+        steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+        for gap in sorted(gap for gap, count in self._across.items() if count == 0):
+            longer = max(steps[:gap].sum(), steps[gap + 1 :].sum()) / max(steps.sum(), 1e-300)
+            unknown = _UNKNOWN_SCALE * min(2.0 * (1.0 - longer), 1.0)
+            self._scale_steps.append(np.full(len(PARTS), max(unknown, SAME_SCALE)))
+            self._links.append((self._frames[gap], self._frames[gap + 1]))
 
     def _solve_window(self, xyz: Float64) -> None:
         """All parts of the pending keyframes; the second half of them is the overlap with the next window."""
         keyframes = self._pending
         window = EvidenceWindow.of(keyframes, xyz)
-        errors = window.errors(self._camera)
+        errors = np.linalg.norm(window.residuals(self._camera)[0], axis=1)
         self._errors.extend([float(np.median(errors))] if len(errors) else [])
+        self._shared.append(shared_error(window, self._camera))
         frames = keyframes[0].frame_index, keyframes[-1].frame_index
         steps = np.zeros(len(PARTS))
         for part, (path, mask) in enumerate(zip(self._paths, self._masks(window), strict=True)):
             steps[part] = _continue(path, self._solved(window, mask), window, self._overlap)
-        thin = window.fewest_across() < _THIN
+        across = window.across()
+        before = len(self._centers) - len(keyframes)
+        for gap, count in enumerate(across.tolist()):
+            self._across[before + gap] = max(self._across.get(before + gap, 0), count)
+        thin = across.min() < _THIN
         if thin:
             steps = np.maximum(np.abs(steps), SAME_SCALE)
         if self._overlap or thin:

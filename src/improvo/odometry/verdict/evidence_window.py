@@ -85,15 +85,15 @@ class EvidenceWindow:
         mask = np.ones(len(self.point), np.bool_) if mask is None else mask
         return np.asarray(mask & (np.bincount(self.point[mask], minlength=len(self.ids)) >= times)[self.point])
 
-    def errors(self, camera: Camera) -> Float64:
-        """Reprojection errors in pixels of what lies in front of its camera."""
+    def residuals(self, camera: Camera) -> tuple[Float64, Int64]:
+        """Pixels (F, 2) that what lies in front of its camera is off, and which observations (F,) these are."""
         in_camera = np.einsum("oij,oj->oi", self.cam_from_world[self.camera, :3, :3], self.xyz[self.point])
         in_camera += self.cam_from_world[self.camera, :3, 3]
-        front = in_camera[:, 2] > 0
-        return np.asarray(np.linalg.norm(camera.project(in_camera[front]) - self.keypoints[front], axis=1))
+        front = np.flatnonzero(in_camera[:, 2] > 0)
+        return np.asarray(camera.project(in_camera[front]) - self.keypoints[front]), front
 
-    def fewest_across(self) -> int:
-        """Points that are seen before and after a gap between two keyframes, at the gap with the fewest.
+    def across(self) -> Int64:
+        """(W - 1,) points that are seen before and after each gap between two keyframes.
 
         Two observations fix no depth and a scale needs one, so a point counts with three.
         """
@@ -103,4 +103,4 @@ class EvidenceWindow:
         np.maximum.at(last, self.point, self.camera)
         known = np.bincount(self.point, minlength=len(self.ids)) >= min(3, count)
         begins, ends = (np.bincount(edge[known], minlength=count) for edge in (first, last))
-        return int((np.cumsum(begins) - np.cumsum(ends))[:-1].min())
+        return np.asarray((np.cumsum(begins) - np.cumsum(ends))[:-1], np.int64)

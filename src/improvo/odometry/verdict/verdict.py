@@ -15,6 +15,7 @@ from improvo.types import Float64
 
 _SCALE_SHARE = 40.0  # % of the path that a change of scale by the factor e moves (calibrated: docs/odometry.md)
 _USUAL_NOISE = 0.0016  # share of the picture's width; the estimate grows with noise that is larger
+_USUAL_SHARED = 0.0007  # the same of what neighbours are off by together: up to 0.0006 by a camera known roughly
 _NOISE_POWER = 3  # noise of 1.4 times the usual one came with 3 to 5 times the spread (docs/robustness-odometry.md)
 _FOCAL_CHANGE = 0.12  # of the logarithm of the focal length, within a window or from one to the next
 _FOCAL_ERROR = 0.2  # of the logarithm of the focal length, from that of the camera as given
@@ -67,8 +68,8 @@ def judge(
         spread: of the paths from the parts of the evidence; None where the segment is too short for one.
         settings: the limits.
         alarms: in plain words; each makes the segment doubtful.
-        suspicions: in plain words; where there is one, a smaller error is enough for a doubt,
-        halvings: by half each.
+        suspicions: in plain words; where there is one, a smaller error is enough for a doubt.
+        halvings: how often the limit is halved then.
     """
     if spread is None:
         return Verdict(DOUBTFUL if alarms else NOT_JUDGED, evidence=(*alarms, "too few keyframes to judge the path"))
@@ -88,18 +89,19 @@ def judge(
 def joined(first: Verdict, second: Verdict, scale_error: float) -> Verdict:
     """The verdict of two stretches of one world, with a scale between them that is known to `scale_error` (relative).
 
-    The worse of the two counts; the scale between them moves half of the path by that share of its size at most.
+    The worse of the two counts: a doubtful one before a right one, then the one with the larger error. The scale
+    between them moves half of the path by that share of its size at most.
     """
     if NOT_JUDGED in (first.word, second.word):
         known = second if first.word == NOT_JUDGED else first
         return Verdict(known.word, known.error_percent, known.noise_px, known.evidence, known.uncertain)
-    errors = first.error_percent, second.error_percent, 50.0 * scale_error
-    worse = first if first.error_percent >= second.error_percent else second
+    better, worse = sorted((first, second), key=lambda each: (each.word == DOUBTFUL, np.nan_to_num(each.error_percent)))
+    alarms = better.evidence[:1] if better.word == DOUBTFUL else ()
     return Verdict(
-        DOUBTFUL if DOUBTFUL in (first.word, second.word) else RIGHT,
-        max(errors),
-        max(first.noise_px, second.noise_px),
-        (*worse.evidence, f"joined, scale ±{100 * scale_error:.1g} %"),
+        worse.word,
+        float(np.nanmax([first.error_percent, second.error_percent, 50.0 * scale_error])),
+        float(np.fmax(first.noise_px, second.noise_px)),
+        (*worse.evidence, *alarms, f"joined, scale ±{100 * scale_error:.1g} %"),
         (*first.uncertain, *second.uncertain),
     )
 
@@ -109,13 +111,15 @@ def estimated_error(spread: Spread) -> float:
 
     The root sum of squares of what the paths of the parts differ by, and of what the least certain change of scale
     moves. Of the two halves of the points the better one counts twice: the other can have too few by chance. Unusual
-    noise is worse than its spread: what does not fit is dropped, so what stays agrees with what is wrong.
+    noise is worse than its spread: what does not fit is dropped, so what stays agrees with what is wrong. So is what
+    neighbours are off by together, which is no noise of keypoints at all: the map follows several motions.
     """
     noise = np.nan_to_num(spread.noise_px) / (_USUAL_NOISE * spread.width)
+    shared = spread.shared_px / (_USUAL_SHARED * spread.width)
     quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
     scale = _SCALE_SHARE * float(_scale_errors(spread).max(initial=0.0))
     spreads = (quarters**2).sum() + len(HALVES) * halves.min() ** 2 + scale**2
-    return float(max(noise, 1.0) ** _NOISE_POWER * np.sqrt(spreads))
+    return float(max(noise, shared, 1.0) ** _NOISE_POWER * np.sqrt(spreads))
 
 
 def _scale_errors(spread: Spread) -> Float64:
@@ -153,9 +157,9 @@ def _told(first: int, last: int, words: str) -> str:
 def _uncertain(spread: Spread) -> tuple[tuple[int, int], ...]:
     """Stretches (first and last frame) across which the parts of the evidence disagree about the scale."""
     found: list[tuple[int, int]] = []
-    for first, last in spread.link_frames[_scale_errors(spread) >= SAME_SCALE].tolist():
+    for first, last in sorted(spread.link_frames[_scale_errors(spread) >= SAME_SCALE].tolist()):
         if found and first <= found[-1][1]:
-            found[-1] = (found[-1][0], last)
+            found[-1] = (found[-1][0], max(last, found[-1][1]))
         else:
             found.append((first, last))
     return tuple(found)
@@ -168,6 +172,8 @@ def _in_words(spread: Spread, error: float) -> str:
     words = f"estimated error {error:.1f} % of the path: "
     if spread.noise_px > 1.5 * _USUAL_NOISE * spread.width:
         words += f"the points are {spread.noise_px:.1f} pixels off, and "
+    if spread.shared_px > 1.25 * _USUAL_SHARED * spread.width:
+        words += f"parts of the picture are off by {spread.shared_px:.2f} pixels together, and "
     scale = float(_scale_errors(spread).max(initial=0.0))
     if _SCALE_SHARE * scale > float(np.linalg.norm(spread.error_percent)):
         first, last = spread.link_frames[int(np.argmax(_scale_errors(spread)))].tolist()
