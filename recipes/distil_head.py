@@ -2,13 +2,13 @@
 
 What the teacher says of a cell, stable or not, is what the new head shall say, reading what the encoder makes of the
 frame. Encoder and other heads stay as they are, bit for bit, so keypoints and descriptors do. Frames are those of a
-pack (recipes/gpu_pack.py); every second one that is wider than 320 pixels is shown at half its size.
+pack (recipes/gpu_pack.py); every second one that is wider than 320 pixels is shown at half its size. Of frames of
+--rooms, recordings of `improvo simulate`, the head shall say the mean of what the teacher says and what is true.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,9 +24,8 @@ from improvo.frontend.network import NetworkFrontend, load_network_frontend, pre
 from improvo.frontend.runtime_torch import load_network
 from improvo.frontend.superpoint import SuperPoint
 from improvo.frontend.weights import find_weights, load_weights, save_weights
+from improvo.simulation.causes import Cause
 from improvo.training.pack import read_pack
-from improvo.training.pictures import Source
-from improvo.training.posed import PosedSequence
 from improvo.types import Float64, UInt8
 
 CELLS = 14_400  # of the frames of a step, which are all of one size: 12 of 320×240
@@ -39,7 +38,7 @@ class Frame:
     """What the head reads, and what it shall say."""
 
     features: Tensor  # (1, C, Hc, Wc) float16, of the encoder
-    stable: Tensor  # (1, Hc, Wc) probability by the teacher
+    stable: Tensor  # (1, Hc, Wc) probability
 
 
 def main() -> None:
@@ -47,6 +46,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pack", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--rooms", type=Path, help="folder of recordings of `improvo simulate`; `crowded` teaches most")
     parser.add_argument("--start", default="superpoint-small")
     parser.add_argument("--teacher", default="superpoint-vo")
     parser.add_argument("--steps", type=int, default=1200)
@@ -58,7 +58,10 @@ def main() -> None:
     network = SuperPoint(architecture).requires_grad_(False).eval()
     network.load_state_dict(load_network(parent).state_dict(), strict=False)
     pictures, posed, data = read_pack(arguments.pack)
-    frames = known_frames([*posed, *pictures.sources], network, arguments.teacher)
+    teacher = load_network_frontend(arguments.teacher)
+    shown = [(picture, None) for source in (*posed, *pictures.sources) for picture in source.pictures]
+    shown += rooms_frames(arguments.rooms) if arguments.rooms else []
+    frames = [known_frame(*halved(number, *one), network, teacher) for number, one in enumerate(shown)]
     print(f"{len(frames)} frames", flush=True)
     network.stability = taught_head(network, frames, arguments.steps, arguments.seed)
     tensors = {name: values.numpy() for name, values in network.state_dict().items() if "num_batches" not in name}
@@ -71,25 +74,38 @@ def main() -> None:
     save_weights(arguments.output, tensors, replace(card, metrics={}, activation_ranges={}))
 
 
-def known_frames(sources: Sequence[PosedSequence | Source], network: SuperPoint, teacher_name: str) -> list[Frame]:
-    """All frames of the sources."""
-    teacher, found = load_network_frontend(teacher_name), []
-    for number, picture in enumerate(picture for source in sources for picture in source.pictures):
-        image = picture
-        if number % 2 and picture.shape[1] > 320:
-            image = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        found.append(known_frame(image, network, teacher))
+def rooms_frames(folder: Path, stride: int = 4) -> list[tuple[UInt8, UInt8]]:
+    """Every so manieth picture of each room and what is unstable in it, (H, W) 0 or 1."""
+    found = []
+    for file in sorted(
+        file for room in sorted(folder.glob("*/labels")) for file in sorted(room.glob("*.png"))[::stride]
+    ):
+        picture = cv2.imread(str(file.parents[1] / "rgb" / file.name), cv2.IMREAD_GRAYSCALE)
+        causes = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        found.append((picture, np.isin(causes, (Cause.MOVING, Cause.HIGHLIGHT)).astype(np.uint8)))
     return found
 
 
-def known_frame(picture: UInt8, network: SuperPoint, teacher: NetworkFrontend) -> Frame:
-    """What the encoder makes of a picture, and the teacher says of it."""
+def halved(number: int, picture: UInt8, unstable: UInt8 | None) -> tuple[UInt8, UInt8 | None]:
+    """Both as they are, or at half the size where the number is odd."""
+    if number % 2 == 0 or picture.shape[1] <= 320:
+        return picture, unstable
+    size = picture.shape[1] // 2, picture.shape[0] // 2
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA), unstable
+
+
+def known_frame(picture: UInt8, unstable: UInt8 | None, network: SuperPoint, teacher: NetworkFrontend) -> Frame:
+    """What the encoder makes of a picture, and what the head shall say of it."""
     height, width = (side // CELL * CELL for side in picture.shape)
     seen = prepare(np.ascontiguousarray(picture[:height, :width]))[None, None]
     logits = torch.from_numpy(teacher.runtime(seen).stability_logits.copy()).float()
+    stable = functional.softmax(logits, dim=-1)[..., 1]
+    if unstable is not None:
+        share = cv2.resize(unstable.astype(np.float32), (width // CELL, height // CELL), interpolation=cv2.INTER_AREA)
+        stable = (stable + 1 - torch.from_numpy(share)) / 2
     with torch.no_grad():
         features = network.encode(torch.from_numpy(seen))
-    return Frame(features.half(), functional.softmax(logits, dim=-1)[..., 1])
+    return Frame(features.half(), stable)
 
 
 def taught_head(network: SuperPoint, frames: list[Frame], steps: int, seed: int) -> nn.Module:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 
 from improvo.frontend.network import load_network_frontend
@@ -47,6 +48,15 @@ def test_cards_name_data_licences_and_figures(name: str) -> None:
     assert path.stat().st_size < 7e6
 
 
+@pytest.mark.parametrize("name", bundled_names())
+def test_every_card_tells_the_head_and_licences_that_allow_to_ship(name: str) -> None:
+    card = load_weights(BUNDLED / f"{name}.safetensors").card
+    assert card.architecture.stability is ("-vo" in name)
+    assert card.licence == "Apache-2.0"
+    assert {source.licence for source in card.data} <= LICENCES
+    assert not [source.name for source in card.data if any(word in source.name for word in FORBIDDEN)]
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_detectors_beat_the_classical_ones_on_noisy_shapes(name: str) -> None:
     tests = shape_tests(10, seed=2000, noise=PhotometricSettings())
@@ -56,6 +66,21 @@ def test_detectors_beat_the_classical_ones_on_noisy_shapes(name: str) -> None:
         assert len(families) == 7
         assert 0 < theirs < ours, classical
     assert ours > 0.15
+
+
+def test_the_small_network_with_a_head_sees_what_the_one_without_sees() -> None:
+    plain, headed = (
+        load_network_frontend(name, max_keypoints=300) for name in ("superpoint-small", "superpoint-vo-small")
+    )
+    for test in shape_tests(2, seed=9):
+        picture = test.image
+        without, with_head = plain(picture), headed(picture)
+        assert without.stability is None
+        assert with_head.stability is not None
+        assert with_head.stability.shape == (len(with_head.keypoints),)
+        assert ((with_head.stability >= 0) & (with_head.stability <= 1)).all()
+        np.testing.assert_allclose(with_head.keypoints, without.keypoints, atol=1e-3)
+        np.testing.assert_allclose(with_head.descriptors, without.descriptors, atol=1e-3)
 
 
 def test_average_precision_of_known_detections() -> None:

@@ -19,10 +19,12 @@ pytest.importorskip("torch", reason="training needs the extra `train`")
 import torch
 
 from improvo import config
+from improvo.frontend.network import load_network_frontend
 from improvo.frontend.registry import load_frontend
 from improvo.frontend.runtime_torch import load_network
 from improvo.frontend.settings import NetworkOptions
 from improvo.frontend.weights import DataSource, find_weights, load_weights
+from improvo.simulation.causes import Cause
 from improvo.training.held_settings import HeldSettings
 from improvo.training.pack import write_pack
 from improvo.training.pictures import Pictures, Source
@@ -124,3 +126,23 @@ def test_a_head_is_taught_to_a_network_without_one(tmp_path: Path, monkeypatch: 
     taught, teacher = (load_frontend(name, 200, network=options) for name in (str(output), "superpoint-vo"))
     said, wanted = ([network.stability_map(frame) for frame in frames] for network in (taught, teacher))
     assert np.abs(np.array(said) - wanted).mean() < 0.1
+
+
+def test_in_rooms_a_head_is_taught_the_mean_of_the_teacher_and_the_truth(tmp_path: Path) -> None:
+    picture = np.random.default_rng(2).integers(0, 256, (96, 352), dtype=np.uint8)
+    causes = np.zeros(picture.shape, np.uint8)
+    causes[:, 176:] = Cause.MOVING
+    for kind, image in (("rgb", picture), ("labels", causes)):
+        (tmp_path / "room" / kind).mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / "room" / kind / "000000.png"), image)
+    distil = recipe("distil_head")
+    [(shown, unstable)] = distil.rooms_frames(tmp_path)
+    np.testing.assert_array_equal(shown, picture)
+    np.testing.assert_array_equal(unstable, causes > 0)
+    assert [image.shape for image in distil.halved(1, shown, unstable)] == [(48, 176), (96, 352)]
+
+    teacher = load_network_frontend("superpoint-vo", precision="float32")
+    network = load_network(load_weights(find_weights("superpoint-vo")))
+    alone, with_truth = (distil.known_frame(shown, truth, network, teacher).stable for truth in (None, unstable))
+    torch.testing.assert_close(with_truth[..., :22], (alone[..., :22] + 1) / 2)
+    torch.testing.assert_close(with_truth[..., 22:], alone[..., 22:] / 2)

@@ -10,7 +10,7 @@ from improvo.frontend import Frontend
 from improvo.frontend.settings import DEFAULT_FRONTEND, FrontendSettings, NetworkOptions, NetworkSettings
 
 CLASSICAL = ("sift", "orb", "akaze", "surf")
-NETWORKS = ("superpoint-vo", "superpoint", "superpoint-small")
+NETWORKS = ("superpoint-vo", "superpoint", "superpoint-vo-small", "superpoint-small")
 
 
 def load_frontend(
