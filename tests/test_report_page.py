@@ -341,3 +341,18 @@ def test_improvement_is_told_with_its_setbacks(tmp_path: Path) -> None:
     unlabelled = [replace(entry, labels={}) for entry in rounds]
     write_improvement_page(tmp_path / "held.html", "Improvement", "", measures, unlabelled)
     assert "<h2>Labels" not in (tmp_path / "held.html").read_text()
+
+
+def test_what_the_page_shows_as_equal_is_no_setback(tmp_path: Path) -> None:
+    measures = [Measure("length", "frames", digits=2), Measure("share", "of matches", digits=2)]
+    rounds = [
+        Round("before", {"length": 4.963, "share": 0.514}),
+        Round("round 1", {"length": 4.957, "share": 0.506}),
+    ]
+    write_improvement_page(tmp_path / "page.html", "Improvement", "", measures, rounds)
+    text = (tmp_path / "page.html").read_text()
+    assert "Worse than before" not in text
+    write_improvement_page(
+        tmp_path / "less.html", "Improvement", "", measures, [rounds[0], Round("r", {"length": 4.95})]
+    )
+    assert "Worse than before: length, 4.96 → 4.95." in (tmp_path / "less.html").read_text()

@@ -129,8 +129,8 @@ def _setbacks(measures: Sequence[Measure], first: Round, last: Round) -> list[st
         before, after = first.values.get(measure.name), last.values.get(measure.name)
         if before is None or after is None:
             continue
-        gain = (after - before) * (1 if measure.larger_is_better else -1)
-        if gain < -0.5 * 10.0**-measure.digits:
+        gain = (round(after, measure.digits) - round(before, measure.digits)) * (1 if measure.larger_is_better else -1)
+        if gain < 0:  # as the page shows it
             lines.append(f"Worse than before: {measure.name}, {_change(measure, first, last)}.")
     return lines
 
