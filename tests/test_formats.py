@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from improvo.cli.main import main
@@ -115,6 +116,10 @@ def test_a_validation(tmp_path: Path) -> None:
     set_format(path, LATER)
     with pytest.raises(InputError, match=LATER_WORDS):
         read_validation(path)
+    write_validation(path, Validation(9, 0, 0, 0.0, 0.0, float("nan"), labels, (scores,), seconds=seconds))
+    untracked = read_validation(path)
+    assert untracked.tracked == 0
+    assert np.isnan(untracked.error)
 
 
 def test_a_checkpoint(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_walk(tmp_path_factory.mktemp("walk") / "walk", frames=24, seed=3)
 
 
-ORB = ["--frontend", "orb", "--max-keypoints", "200", "--max-frames", "18"]
+ORB = ["--frontend", "orb", "--max-keypoints", "200"]
 
 
 def test_run(walk: Path, tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_run(walk: Path, tmp_path: Path) -> None:
     assert statuses[-1] == 0
     assert len(statuses) > 3
     assert contents(killed) == contents(calm)
-    assert json.loads((killed / "run.json").read_text())["frames"]["tracked"] == 18
+    assert json.loads((killed / "run.json").read_text())["frames"]["tracked"] > 15
 
 
 @pytest.mark.parametrize(("layout", "needs"), [("colmap", "pycolmap"), ("hloc", "h5py")])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -148,13 +149,19 @@ def test_an_interrupt_within_a_recording_leaves_it_to_the_next_command(
     assert label_sequences(walks[:1], tmp_path / "labels", settings())[0].state == DONE
 
 
-def test_another_recording_of_the_same_name_is_not_taken_for_the_one_that_is_done(
+def test_another_recording_of_the_same_name_gets_another_and_one_that_moved_is_refused(
     walks: list[Path], tmp_path: Path
 ) -> None:
-    label_sequences(walks[:1], tmp_path / "labels", settings())
-    other = write_walk(tmp_path / "elsewhere" / "kitchen", frames=20, seed=7)
-    with pytest.raises(InputError, match="the store has another recording named kitchen; rename one of them"):
-        label_sequences([other], tmp_path / "labels", settings())
+    here, there = tmp_path / "kitchen", tmp_path / "elsewhere" / "kitchen"
+    shutil.copytree(walks[0], here)
+    shutil.copytree(walks[1], there)
+    assert label_sequences([here], tmp_path / "labels", settings())[0].name == "kitchen"
+    assert label_sequences([there], tmp_path / "labels", settings())[0].name == "elsewhere-kitchen"
+    assert [record.state for record in read_records(tmp_path / "labels")] == [DONE, DONE]
+    (tmp_path / "new").mkdir()
+    here.rename(tmp_path / "new" / "kitchen")
+    with pytest.raises(InputError, match="if it has moved, move it back or use another folder"):
+        label_sequences([tmp_path / "new" / "kitchen"], tmp_path / "labels", settings())
 
 
 def test_what_cannot_be_put_in_place_is_told(walks: list[Path], tmp_path: Path) -> None:

@@ -194,7 +194,8 @@ def test_a_plan_after_a_folder_is_of_the_new_recordings_with_its_weights(
 ) -> None:
     old, new = (write_walk(tmp_path / name, frames=4, seed=0) for name in ("old", "new"))
     before = tmp_path / "before"
-    before.mkdir()
+    (before / "round-1").mkdir(parents=True)
+    (before / "round-1" / "judgement.json").write_text("{}")
     shutil.copy(find_weights("superpoint-small"), before / "weights.safetensors")
     (before / "settings.yaml").write_text("rounds: 1\n")
     part = {"paths": [str(old)], "sequence": {}}

@@ -18,7 +18,7 @@ from improvo.errors import InputError
 from improvo.odometry.run_folder import RunFolder, why_no_pose
 from improvo.stability.rule import IGNORE
 
-FRAMES = 20
+FRAMES = 30
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +177,7 @@ def test_a_second_run_that_fails_before_its_first_file_leaves_the_first_one(
     with monkeypatch.context() as patch:
         patch.setattr("improvo.odometry.visual_odometry.VisualOdometry.finish", bug)
         with pytest.raises(RuntimeError, match="in the middle"):
-            main(words(walk, out, "--end", "15"))
+            main(words(walk, out, "--end", "26"))
     assert without_times(out) == before
     assert (out / "run.json").read_bytes() == report
 
@@ -194,11 +194,11 @@ def test_a_second_run_that_is_stopped_between_its_files_is_no_result(
     with monkeypatch.context() as patch:
         patch.setattr(stopped_at, stop)
         with pytest.raises(SystemExit):
-            main(words(walk, out, "--end", "15"))
+            main(words(walk, out, "--end", "26"))
     with pytest.raises(InputError, match=r"has no run\.json; give the output folder of `improvo run`"):
         RunFolder(out)
-    assert main(words(walk, out, "--end", "15")) == 0
-    assert RunFolder(out).frames == 15
+    assert main(words(walk, out, "--end", "26")) == 0
+    assert RunFolder(out).frames == 26
 
 
 def test_a_second_run_takes_away_what_it_does_not_write_again(out: Path, walk: Path, tmp_path: Path) -> None:

@@ -121,7 +121,7 @@ SOURCES: dict[str, tuple[Callable[[Sequence], ScaleSettings], float]] = {
         lambda sequence: ScaleSettings("distance", distances=((3, 33, distance_between(sequence, 3, 33)),)),
         0.03,
     ),
-    "height": (lambda sequence: ScaleSettings("height", float(np.median(heights(sequence)))), 0.05),
+    "height": (lambda sequence: ScaleSettings("height", float(np.median(heights(sequence)))), 0.06),
     "marker": (lambda sequence: ScaleSettings("marker", MARKER), 0.03),
 }
 

@@ -100,7 +100,7 @@ def test_run_finds_the_camera_once_and_says_so(
 ) -> None:
     asked = counted(monkeypatch)
     out = tmp_path / "out"
-    words = ["run", str(walk), "--camera", "auto", "-o", str(out), "--frontend", "orb", "--max-frames", "12"]
+    words = ["run", str(walk), "--camera", "auto", "-o", str(out), "--frontend", "orb", "--max-frames", "20"]
     assert main(words) == 0
     assert "camera from the motion: brown, fx 260.0, fy 260.0 (+- 0.19 %)" in capsys.readouterr().out
     report = json.loads((out / "run.json").read_text())
@@ -109,14 +109,14 @@ def test_run_finds_the_camera_once_and_says_so(
     assert improvo.RunFolder(out).image(0).shape == (240, 320)
     assert main(words) == 0
     assert len(asked) == 1  # the second run reads the file
-    assert main([*words, "--max-frames", "14"]) == 0
+    assert main([*words, "--max-frames", "22"]) == 0
     assert len(asked) == 2  # of other frames it would be another
 
 
 def test_a_moved_run_still_opens_its_recording(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     counted(monkeypatch)
     out = tmp_path / "out"
-    words = ["run", str(walk), "--camera", "auto", "-o", str(out), "--frontend", "orb", "--max-frames", "12"]
+    words = ["run", str(walk), "--camera", "auto", "-o", str(out), "--frontend", "orb", "--max-frames", "20"]
     assert main(words) == 0
     out.rename(tmp_path / "moved")
     assert improvo.RunFolder(tmp_path / "moved").image(3).shape == (240, 320)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -223,7 +223,9 @@ def read_validation(path: Path) -> Validation:
     check_format(values.pop(FORMAT_KEY, None), path, mend)
     error = values.get("error", 0.0)
     try:
-        read = config.from_dict(Validation, {**values, "error": float("nan") if error is None else error})
+        read = config.from_dict(Validation, {**values, "error": 0.0 if error is None else error})
+        if error is None:  # nothing was tracked; NaN is no JSON, and settings have no NaN
+            read = replace(read, error=float("nan"))
         if not (_belongs_together(read) and {"label", "evaluate"} <= read.seconds.keys()):
             raise ConfigError("values that do not belong together")
     except ConfigError:
