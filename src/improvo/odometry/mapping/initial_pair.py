@@ -98,7 +98,7 @@ def _rotation_explains_tracks(a: View, b: View, camera: Camera, settings: Odomet
     if world.sum() < settings.start.min_points:
         return False
     residuals = rotation_residuals(camera, a.keypoints[rows_a[world]], b.keypoints[rows_b[world]])
-    return bool(np.median(residuals) < gate(_STRICT * settings.tolerance))
+    return bool(np.median(residuals) < _STRICT * settings.tolerance)
 
 
 def _with_points(
