@@ -149,7 +149,7 @@ def test_the_order_of_rows_changes_no_judgement_of_labels(tmp_path: Path) -> Non
 
     walk = write_walk(tmp_path / "walk", frames=16)
     out = tmp_path / "labels"
-    words = ["--frontend", "orb", "--max-keypoints", "200", "--set", "labels.min_observations=6"]
+    words = ["--frontend", "orb", "--max-keypoints", "500", "--set", "labels.min_observations=6"]
     assert main(["label", str(walk), "-o", str(out), *words]) == 0
     before = [read_tracks(out / "walk" / TRACKS_FILE), read_points(out / "walk" / POINTS_FILE)]
     reverse_tracks(out / "walk")
