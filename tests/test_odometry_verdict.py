@@ -52,11 +52,11 @@ def test_each_kind_of_evidence_can_make_a_segment_doubtful() -> None:
     alarmed = judge(GOOD, SETTINGS, ("two motions",))
     assert (alarmed.word, alarmed.evidence[0]) == (DOUBTFUL, "two motions")
     assert judge(GOOD, SETTINGS, (), ("two motions",)).word == RIGHT
-    worse = replace(GOOD, error_percent=np.full(6, 1.2))
+    worse = replace(GOOD, error_percent=np.full(6, 1.8))
     assert (judge(worse, SETTINGS).word, judge(worse, SETTINGS, (), ("two motions",)).word) == (RIGHT, DOUBTFUL)
     assert judge(worse, SETTINGS, (), ("two maps were contradicted",), 2).word == DOUBTFUL
-    slightly = replace(GOOD, error_percent=np.full(6, 0.7))
-    words = [judge(slightly, SETTINGS, (), ("contradicted",), halvings).word for halvings in (1, 2)]
+    slightly = replace(GOOD, error_percent=np.full(6, 1.35))
+    words = [judge(slightly, SETTINGS, (), ("contradicted",), times).word for times in (1, 2)]
     assert words == [RIGHT, DOUBTFUL]
     assert judge(None, SETTINGS).word == NOT_JUDGED
     assert judge(None, SETTINGS, ("two motions",)).word == DOUBTFUL

@@ -23,7 +23,7 @@ class SegmentJudge:
         self._evidence = EvidenceCheck(camera)
         self._alarms: list[str] = []
         self._suspicions: list[str] = []
-        self._halvings = 0
+        self._suspected = 0
 
     def final(self, view: View, cam_from_world: Float64, xyz: Float64) -> None:
         """A view is final; keyframes are evidence.
@@ -41,14 +41,14 @@ class SegmentJudge:
         if words not in self._alarms:
             self._alarms.append(words)
 
-    def suspicion(self, words: str, halvings: int = 1) -> None:
+    def suspicion(self, words: str, times: int = 1) -> None:
         """Something that right segments show now and then, too; the same words count once.
 
         Args:
             words: plain.
-            halvings: how often it halves the error that is enough for a doubt; of several, the largest counts.
+            times: how often it was so, each of which makes a smaller error enough; of several, the largest counts.
         """
-        self._halvings = max(self._halvings, halvings)
+        self._suspected = max(self._suspected, times)
         if words not in self._suspicions:
             self._suspicions.append(words)
 
@@ -59,4 +59,4 @@ class SegmentJudge:
             xyz: (P, 3) its points.
         """
         spread, limits = self._evidence.finish(xyz), self._settings.verdict
-        return judge(spread, limits, tuple(self._alarms), tuple(self._suspicions), self._halvings)
+        return judge(spread, limits, tuple(self._alarms), tuple(self._suspicions), self._suspected)

@@ -23,6 +23,7 @@ _SIGMAS = 5.0  # standard errors that a deviation of the focal length must excee
 _SIGMAS_OF_GROWTH = 8.0  # its change within a window, which a step ahead imitates; 6.7 at most in right recordings
 _RARE = 0.01  # share of windows that say so in right recordings; one of the hundreds of a long one is no alarm
 _LARGEST_LENS_ERROR = 0.06  # of the logarithm of a focal length; a window that knows it less well says nothing of it
+_SUSPECTED = 0.75  # of the error that a segment may have, where something speaks against it that right ones show, too
 RIGHT, DOUBTFUL, NOT_JUDGED = "right", "doubtful", "not judged"
 
 
@@ -60,7 +61,7 @@ def judge(
     settings: VerdictSettings,
     alarms: tuple[str, ...] = (),
     suspicions: tuple[str, ...] = (),
-    halvings: int = 1,
+    suspected: int = 1,
 ) -> Verdict:
     """The verdict of a segment by the spread of its path, and by what else was seen.
 
@@ -69,7 +70,7 @@ def judge(
         settings: the limits.
         alarms: in plain words; each makes the segment doubtful.
         suspicions: in plain words; where there is one, a smaller error is enough for a doubt.
-        halvings: how often the limit is halved then.
+        suspected: how often; each time three quarters of the error are enough.
     """
     if spread is None:
         return Verdict(DOUBTFUL if alarms else NOT_JUDGED, evidence=(*alarms, "too few keyframes to judge the path"))
@@ -81,7 +82,7 @@ def judge(
     evidence = [*alarms, *suspicions, _in_words(spread, error)]
     evidence += [words for words in of_lens[:1] if words not in alarms]
     evidence += [f"frames {first} to {last}: the scale is not determined" for first, last in uncertain]
-    limit = settings.max_error * 0.5 ** (halvings if suspicions else 0)
+    limit = settings.max_error * _SUSPECTED ** (suspected if suspicions else 0)
     word = RIGHT if error <= limit and not alarms else DOUBTFUL
     return Verdict(word, error, spread.noise_px, tuple(evidence), uncertain)
 
