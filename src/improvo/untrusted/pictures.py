@@ -27,7 +27,7 @@ def check_picture(data: bytes) -> None:
     """
     try:
         sizes = list(_sizes(data))
-    except (struct.error, IndexError):
+    except (struct.error, IndexError, OverflowError):  # the last where it points beyond all memory
         raise ValueError("the image is truncated") from None
     if not sizes:
         raise ValueError("not a readable image")
