@@ -12,6 +12,10 @@ class ImprovoError(Exception):
     The command line prints it and exits with status 2.
     """
 
+    def __str__(self) -> str:
+        """The message; a name out of a damaged file may have line breaks, which are written as `\\n`."""
+        return super().__str__().replace("\n", "\\n")
+
 
 class InputError(ImprovoError):
     """An input (recording, calibration, trajectory, weights, ...) is missing, unreadable or inconsistent."""
