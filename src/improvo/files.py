@@ -50,6 +50,11 @@ def is_same_file(one: Path, other: Path) -> bool:
         return False
 
 
+def content_hash(path: Path) -> str:
+    """SHA-256 of what is in a file, hexadecimal: by it weights are known whatever they are called."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
 @contextmanager
 def written_atomically(path: Path) -> Iterator[Path]:
     """A temporary path beside `path` to write to; it replaces `path` when the block ends, and vanishes if it fails.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.metadata
 import re
 import zlib
@@ -13,6 +12,7 @@ from typing import Any, Protocol
 
 from improvo.errors import ConfigError, InputError
 from improvo.evaluation.settings import PEERS
+from improvo.files import content_hash
 from improvo.frontend import Frontend
 from improvo.frontend.masking import features_of
 from improvo.sequences import Sequence, SequenceSettings
@@ -163,7 +163,7 @@ def _weights_digest(name: str) -> str | None:
 
     if name not in bundled_names() and not name.endswith(".safetensors"):
         return None
-    return hashlib.sha256(find_weights(name).read_bytes()).hexdigest()
+    return content_hash(find_weights(name))
 
 
 def file_name(label: str) -> str:

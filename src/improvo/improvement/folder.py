@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from typing import Any
 from improvo import config
 from improvo.continuation import SettingsRecord
 from improvo.errors import ConfigError
-from improvo.files import check_output_folder, make_output_folder
+from improvo.files import check_output_folder, content_hash, make_output_folder
 from improvo.improvement.settings import ImproveSettings
 from improvo.locations import removed
 from improvo.sequences.given_files import CONTENTS, contents_of_given
@@ -98,7 +97,7 @@ class ImproveFolder:
         check_output_folder(folder, COMMAND)
         self.folder = folder
         values = config.to_dict(settings)
-        values["frontend"]["name"] = f"sha256:{hashlib.sha256(start.read_bytes()).hexdigest()}"
+        values["frontend"]["name"] = f"sha256:{content_hash(start)}"
         values |= contents_of_given(settings.sequence)
         values["sequences"] = [str(path.resolve()) for path in sequences]
         values["evaluate"] = [str(path.resolve()) for path in evaluate]

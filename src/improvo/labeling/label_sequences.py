@@ -14,6 +14,7 @@ import numpy as np
 
 from improvo.config import to_dict
 from improvo.errors import ImprovoError, InputError, OutputError
+from improvo.files import content_hash
 from improvo.folder_lock import BusyError, claimed, seems_held
 from improvo.jobs.crew import Crew
 from improvo.jobs.processes import Tick
@@ -268,12 +269,10 @@ def _failure(job: LabelJob, error: Exception) -> SequenceRecord:
 
 def fingerprint(settings: RunSettings, pack: bool) -> dict[str, Any]:
     """Everything that the labels depend on; weights, camera and mask by what is in them."""
-    import hashlib
-
     values = {**to_dict(settings), "pack": pack, **contents_of_given(settings.sequence)}
     weights = Path(settings.frontend.name)
     if weights.suffix == ".safetensors" and weights.is_file():
-        values["frontend"]["name"] = f"sha256:{hashlib.sha256(weights.read_bytes()).hexdigest()}"
+        values["frontend"]["name"] = f"sha256:{content_hash(weights)}"
     return values
 
 

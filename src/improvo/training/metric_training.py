@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -61,7 +60,7 @@ def train_metric(
         record, values = SettingsRecord(output / SETTINGS, MetricSettings, []), config.to_dict(settings)
         record.check(values, "give the same settings or another output folder")
         record.write(values)
-        started_from = {"start": start.name, "start_sha256": hashlib.sha256(start.read_bytes()).hexdigest()}
+        started_from = {"start": start.name, "start_sha256": files.content_hash(start)}
         rows = read_metrics(output / METRICS)
         if rows and _is_of(output / WEIGHTS, started_from):
             return rows[-1]

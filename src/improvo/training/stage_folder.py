@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -122,7 +121,7 @@ def model_card(
         training={
             "stage": stage,
             "start": start.name if start else "random",
-            "start_sha256": hashlib.sha256(start.read_bytes()).hexdigest() if start else "",
+            "start_sha256": files.content_hash(start) if start else "",
             "stability_trained": False,
             "seed": settings.optimiser.seed,
             "settings": config.to_dict(settings),
