@@ -14,7 +14,7 @@ from PIL import Image
 from improvo.cli.main import main
 from improvo.geometry.se3 import rigid, so3_exp
 from improvo.odometry.run_folder import RunFolder
-from improvo.report.canvas import Canvas
+from improvo.report.canvas import Canvas, captioned
 from improvo.report.overhead import overhead_axes, robust_limits
 from improvo.report.palettes import PALETTES
 from improvo.report.sheets import write_video
@@ -217,6 +217,24 @@ def test_a_second_later_is_one_whatever_the_rate_is_there(tmp_path: Path) -> Non
     assert _pair("3,+1.5s", sequence) == [3, 5]
     assert _pair("5,+1s", sequence) == [5, 15]
     assert _pair("0,+0.01s", sequence) == [0, 1]
+
+
+@pytest.mark.parametrize("width", [40, 160, 320, 640, 1280, 1920])
+@pytest.mark.parametrize(
+    "words", ["short", "frame 10, superpoint-vo: 357 stable keypoints (white), circled: 1", "w" * 400]
+)
+def test_a_caption_leaves_the_legend_alone(width: int, words: str) -> None:
+    legend = (PALETTES["paper"].ramp_strip(), "stable", "unstable")
+    picture = np.zeros((20, width, 3), np.uint8)
+    bare, with_words = captioned(picture, "", legend), captioned(picture, words, legend)
+    assert bare.shape == with_words.shape
+    written = np.flatnonzero((bare != with_words).any(axis=(0, 2)))
+    of_legend = np.flatnonzero((bare[20:] != 24).any(axis=(0, 2)))
+    assert len(written) > 0 or width == 40
+    assert (len(of_legend) > 0) == (width >= 320)
+    if len(of_legend) and len(written):
+        assert written.max() + 4 < of_legend.min()
+    assert (with_words[:, -4:] == bare[:, -4:]).all()
 
 
 def test_suppressed_regions_are_where_most_suppressed_points_are() -> None:
