@@ -321,6 +321,54 @@ def test_a_label_store_has_a_page_with_what_failed_and_why(finished_run: Path, t
     assert text.count("data:image/png") == 2  # the map from above, and the same for a telephone
     assert "Withheld: it had a label" in text
     assert main(["report", str(labels / "walk"), "-o", str(tmp_path / "one.html")]) == 0
+    assert main(["report", str(labels), "--palette", "colour-blind"]) == 0
+    pictures = re.compile(r"data:image/png[^\"]*")
+    assert set(pictures.findall((labels / "report.html").read_text())).isdisjoint(pictures.findall(text))
+
+
+def test_the_place_of_a_recording_is_refused_where_there_is_no_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "vo.json").write_text('{"rows": [1]}')
+    (tmp_path / "vo.md").write_text("# Table\n")
+    assert main(["report", str(tmp_path), "--sequence", "walk"]) == 2
+    assert "--sequence walk: belongs to the folder of a run" in capsys.readouterr().err
+
+
+def with_poses(finished: Path, folder: Path, kept: list[int]) -> Path:
+    """A copy of a run in which only these frames have a pose."""
+    shutil.copytree(finished, folder)
+    lines = (folder / "trajectory.txt").read_text().splitlines(keepends=True)
+    comments, poses = ([line for line in lines if line.startswith("#") == is_one] for is_one in (True, False))
+    (folder / "trajectory.txt").write_text("".join([*comments, *(poses[number] for number in kept)]))
+    content = json.loads((folder / "run.json").read_text())
+    lost = [number for number in range(content["frames"]["processed"]) if number not in kept]
+    content["frames"].update(tracked=len(kept), lost=len(lost), lost_frames=lost)
+    (folder / "run.json").write_text(json.dumps(content))
+    return folder
+
+
+@pytest.mark.parametrize("kept", [[5], [5, 6], [5, 9]])
+def test_a_run_with_one_or_two_poses_has_a_map_and_a_page(finished_run: Path, tmp_path: Path, kept: list[int]) -> None:
+    run = with_poses(finished_run, tmp_path / "run", kept)
+    assert main(["show", "map", str(run)]) == 0
+    assert main(["report", str(run)]) == 0
+    assert f"{len(kept)} of 30" in (run / "report.html").read_text()
+
+
+def test_a_run_without_frames_is_one_line(
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As one that was interrupted before its first."""
+    run = with_poses(finished_run, tmp_path / "run", [])
+    content = json.loads((run / "run.json").read_text())
+    content["frames"].update(processed=0, tracked=0, lost=0, lost_frames=[], source_index=[])
+    content["segments"] = []
+    (run / "run.json").write_text(json.dumps(content))
+    for words in (["tracks", "--frames", "all"], ["labels"], ["residuals", "--video"]):
+        assert main(["show", words[0], str(run), *words[1:]]) == 2
+        assert capsys.readouterr().err == f"improvo: {run}: has no frames to draw\n"
+    assert main(["report", str(run)]) == 0
 
 
 def test_a_wide_table_and_the_map_fit_on_paper(page: Path, tmp_path: Path, browser: Any) -> None:

@@ -72,4 +72,4 @@ def _named(names: list[str]) -> str:
 
 
 def _words(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else ("-" if value is None else str(value))
+    return f"{value:,.1f}" if isinstance(value, float) else ("-" if value is None else str(value))

@@ -84,7 +84,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
             (str(len(report["segments"])), "segments (1 is best)"),
             *_verdict_tile(report),
             (f"{report['points']:,}", "map points"),
-            *([(f"{_path_length(run):.4g} m", "path of the camera")] if report.get("metric") else []),
+            *([(_metres(_path_length(run)), "path of the camera")] if report.get("metric") else []),
             *([(f"{truth.ate_percent:.2g} %", "of the path off the true one (ATE)")] if truth is not None else []),
             (f"{median_error:.2f} px" if np.isfinite(median_error) else "-", "median re-projection error"),
             (f"{report['frames_per_second']:g}", "frames per second"),
@@ -120,6 +120,11 @@ def _path_length(run: RunFolder) -> float:
     """Summed over the segments."""
     steps = np.linalg.norm(np.diff(run.trajectory.camera_centers, axis=0), axis=1)
     return float(steps[np.diff(run.trajectory.segment) == 0].sum())
+
+
+def _metres(length: float) -> str:
+    """Four digits, and of what is longer than that all of them."""
+    return f"{length:.4g} m" if length < 1000 else f"{length:,.0f} m"
 
 
 def _map_section(page: Page, run: RunFolder, palette: Palette, truth: TruePath | None) -> None:
