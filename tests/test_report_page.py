@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -21,6 +22,8 @@ from improvo.report.charts import line_chart
 from improvo.report.improvement_page import Measure, Round, write_improvement_page
 from improvo.report.page import Page
 from improvo.report.plain_words import ranges, warnings
+from improvo.report.true_path import true_path
+from improvo.types import Trajectory
 
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 FLAGS = (
@@ -241,6 +244,48 @@ def test_chart_leaves_gaps_where_there_is_nothing() -> None:
     assert svg.count("<polyline") == 2
     assert "a &lt; b" in svg
     assert line_chart(x, np.full(10, np.nan), "nothing").count("<polyline") == 0
+
+
+def test_names_with_bars_stay_in_their_cell(tmp_path: Path) -> None:
+    from improvo.evaluation.tables import markdown
+
+    text = markdown(["what", "a"], [["attic | morning", "1"], ["two\nlines", "2|"]])
+    assert len(text.splitlines()) == 4
+    page = Page("tables", "of names")
+    page.markdown(text)
+    page.markdown("| plain | b |\n|---|--:|\n| c | d |\n")
+    page.write(tmp_path / "page.html")
+    rows = re.findall("<tr>(.*?)</tr>", (tmp_path / "page.html").read_text())
+    assert [re.findall("<t[hd]>(.*?)</t[hd]>", row) for row in rows] == [
+        *(["what", "a"], ["attic | morning", "1"], ["two\\nlines", "2|"]),
+        *(["plain", "b"], ["c", "d"]),
+    ]
+
+
+def test_a_true_path_with_gaps_is_as_long_as_it_is() -> None:
+    """Where every second frame has no truth, the error is a share of the whole path all the same."""
+    angle = np.linspace(0, 3, 60)
+    true = np.stack([np.cos(angle), np.sin(angle), 0.1 * angle], axis=1)
+    estimate = 0.5 * true + np.random.default_rng(0).normal(0, 0.004, true.shape)
+    found = []
+    for without in (slice(0, 0), slice(1, None, 2), slice(20, 40)):
+        poses = np.tile(np.eye(4), (60, 1, 1))
+        poses[:, :3, 3] = true
+        poses[without] = np.nan
+        estimated = np.tile(np.eye(4), (60, 1, 1))
+        estimated[:, :3, 3] = estimate
+        sequence = SimpleNamespace(ground_truth=Trajectory(np.arange(60.0), poses), indices=np.arange(60))
+        run = SimpleNamespace(
+            trajectory=Trajectory(np.arange(60.0), estimated),
+            sequence=sequence,
+            source_index=list(range(60)),
+            frame_indices=np.arange(60),
+        )
+        path = true_path(run)  # type: ignore[arg-type]
+        assert path is not None
+        assert (np.isfinite(path.errors) == np.isfinite(poses[:, 0, 0])).all()
+        found.append(path.ate_percent)
+    np.testing.assert_allclose(found, 100 * 0.004 * np.sqrt(3) / 1.505, rtol=0.2)
 
 
 def test_chart_shows_a_value_that_stands_alone() -> None:

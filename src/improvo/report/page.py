@@ -17,6 +17,8 @@ from improvo.files import write_text
 _ABSOLUTE = re.compile(r"(?<![\w./:])(?:/(?:[^/\s\"'`<>|]+/)+|[A-Za-z]:\\(?:[^\\\s\"'`<>|]+\\)+)(?=[^/\s])")
 
 
+_BAR = re.compile(r"(?<!\\)\|")  # between two cells of a table
+_EDGES = re.compile(r"^\s*\||(?<!\\)\|\s*$")  # its bars at both ends
 _WIDE = 2.0  # width over height of pictures that would be too small beside each other
 
 
@@ -105,7 +107,7 @@ class Page:
                     self.html(f"<h3>{plain(line.lstrip('# '))}</h3>")
                 elif line.strip():
                     self.html(f"<p>{_cell(line)}</p>")
-            rows = [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in table]
+            rows = [[cell.strip().replace("\\|", "|") for cell in _BAR.split(_EDGES.sub("", line))] for line in table]
             rows = [row for row in rows if not all(re.fullmatch(r":?-+:?", cell) for cell in row)]
             if rows:
                 self.table(rows[0], rows[1:])
