@@ -175,6 +175,25 @@ def test_report_without_its_recording_says_so(finished_run: Path, tmp_path: Path
     assert 'id="scene"' in text
 
 
+def test_folders_with_spaces_are_left_out_too(finished_run: Path, tmp_path: Path) -> None:
+    home = tmp_path / "jane doe" / "my videos"
+    home.mkdir(parents=True)
+    walk, run = home / "walk", home / "run"
+    shutil.copytree(finished_run.parent / "walk", walk)
+    shutil.copytree(finished_run, run)
+    content = json.loads((run / "run.json").read_text())
+    content["input"].update(path=str(walk), notes=[f"{walk}: is only a test"])
+    content["input"]["skipped"] = [{"source": str(walk / "000007.png"), "reason": "is damaged \ud83d"}]
+    content["configuration"]["sequence"].update(mask="C:\\Users\\jane\\mask.png", camera=str(walk / "camera.yaml"))
+    (run / "run.json").write_text(json.dumps(content))
+    assert main(["report", str(run)]) == 0
+    text = (run / "report.html").read_text()
+    assert "jane" not in text
+    assert "my videos" not in text
+    for word in ("walk: is only a test", "first is walk/000007.png", "mask.png", "camera.yaml", "is damaged \ufffd"):
+        assert word in text
+
+
 def test_text_of_others_is_escaped(tmp_path: Path) -> None:
     page = Page("<script>alert(1)</script>", "a & b")
     page.table(["<b>", "x"], [["**1**", "</td>"]])

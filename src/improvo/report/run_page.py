@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from improvo.odometry.verdict.told_verdicts import verdict_lines, verdict_of
 from improvo.odometry.verdict.verdict import DOUBTFUL
 from improvo.report.charts import line_chart
 from improvo.report.map_picture import map_png, trusted_points
-from improvo.report.page import Page, plain, swatch
+from improvo.report.page import Page, as_json, plain, swatch
 from improvo.report.page_data import frames_data, per_frame, scene_data
 from improvo.report.palettes import PALETTES, Palette
 from improvo.report.plain_words import LABEL_WORDS, warnings
@@ -75,6 +74,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
         f"Visual odometry of {run.name}",
         f"{frames['processed']} frames of {run.camera.width}x{run.camera.height}, {report['input']['format']}; "
         f"frontend {report['frontend']}; poses and map are {run.unit}.",
+        folders=[run.recorded_input.parent, run.path.absolute().parent],
     )
     tracks = run.points.counts()
     truth = true_path(run)
@@ -236,8 +236,8 @@ def _timing_section(page: Page, run: RunFolder) -> None:
         f"{camera['cx']:.2f}, cy {camera['cy']:.2f} px; images: {report['input']['view']}; "
         f"input {report['input']['path']}."
     )
-    page.details("All settings", json.dumps(report["configuration"], indent=2))
-    page.details("Versions", json.dumps(report["versions"], indent=2))
+    page.details("All settings", as_json(report["configuration"]))
+    page.details("Versions", as_json(report["versions"]))
 
 
 def _css(palette: Palette, label: str) -> str:
