@@ -153,7 +153,7 @@ class RunFolder:
         own = self.path / "camera.yaml"  # found for this run (`--camera auto`), which may have been moved
         if settings.camera is not None and own.is_file() and Path(settings.camera).name == own.name:
             settings = replace(settings, camera=str(own))
-        path = self._sequence_path or self.recorded_input
+        path = check_path(self._sequence_path or self.recorded_input, reachable=True)
         if not path.exists():
             raise InputError(f"{path}: the recording is not there any more; name it with --sequence PATH")
         sequence = open_sequence(path, settings)
