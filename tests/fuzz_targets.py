@@ -358,7 +358,7 @@ def _own_targets() -> dict[str, Target]:
     from labeled_scene import write_labeled_scene
 
     def store(name: str, folder: Path) -> Path:
-        return write_labeled_scene(folder / "labels") / name
+        return write_labeled_scene(folder / "labels", frames=4, every=40) / name
 
     def read_store(path: Path) -> None:
         for one in read_labels(next(parent for parent in path.parents if parent.name == "labels")):
