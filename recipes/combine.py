@@ -32,9 +32,7 @@ def combined(parts: list[tuple[str, Weights, float]]) -> Weights:
         raise ConfigError("factors: must sum to one")
     left_out = {name for _, weights, _ in parts for name in weights.tensors} - set(parts[0][1].tensors)
     if left_out:
-        raise ConfigError(
-            f"{min(left_out)}: is not in the first file, whose layers the sum has; give another first"
-        )
+        raise ConfigError(f"{min(left_out)}: is not in the first file, whose layers the sum has; give another first")
     tensors = {}
     for name in parts[0][1].tensors:
         having = [
