@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -226,6 +227,25 @@ def test_motions_that_do_not_tell_the_camera_are_refused(motion: Float64, world:
     with pytest.raises(InputError, match=r"^video: .*; walk sideways") as error:
         refuse_unsure(result(lens_of_pieces([piece(world, motion)], 320, 240, SETTINGS, "video")), "video", SETTINGS)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"fov": float("nan")}, "the distortion found has no inverse"),
+        ({"deviations": dict.fromkeys(NAMES, float("nan"))}, "leaves the focal length open"),
+        ({"rms": float("nan")}, "no camera explains it"),
+    ],
+)
+def test_a_camera_without_numbers_is_refused(change: dict[str, Any], said: str) -> None:
+    good = CameraFromMotion(SMALL.camera, dict.fromkeys(NAMES, 0.1), 0.4, 60, 60, 30, 200, 2000, SMALL.fov, 0.0, 0.001)
+    refuse_unsure(good, "walk", SETTINGS)
+    with pytest.raises(InputError, match=said):
+        refuse_unsure(replace(good, **change), "walk", SETTINGS)
+
+
+def test_a_lens_that_folds_within_the_picture_has_no_field_of_view() -> None:
+    assert np.isnan(Lens(np.array([300.0, 310.0, 322.0, 241.0, -0.35, 0.0]), "brown", 640, 480).fov)
 
 
 def test_pieces_cover_short_videos_and_sample_long_ones() -> None:
