@@ -245,6 +245,23 @@ def in_two_segments(finished: Path, folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--min-observations", "0"], "--min-observations 0: must be at least 1"),
+        (["--max-error", "nan"], "--max-error nan: must be positive"),
+        (["--max-error", "-1"], "--max-error -1: must be positive"),
+    ],
+)
+def test_an_export_of_nothing_is_refused(
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    for target in ("colmap", "nerfstudio"):
+        assert main(["export", target, str(finished_run), "-o", str(tmp_path / "new"), *words]) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
 def test_segments_are_models_of_their_own_the_longest_first(
     finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,9 @@ from improvo.cli.main import main
 from improvo.geometry.se3 import rigid, so3_exp
 from improvo.odometry.run_folder import RunFolder
 from improvo.report.canvas import Canvas, captioned
+from improvo.report.map_picture import map_png
 from improvo.report.overhead import overhead_axes, robust_limits
+from improvo.report.page_data import pixel_parts
 from improvo.report.palettes import PALETTES
 from improvo.report.sheets import write_video
 from improvo.report.stability_picture import suppressed_regions
@@ -73,6 +76,29 @@ def test_map_has_white_points_a_jet_trajectory_and_a_black_last_window(finished_
     assert ((green > 180) & (blue > 60) & (red < 200) & (abs(red - green) > 40)).sum() > 20, "no middle of the ramp"
     assert (drawn.max(axis=-1) < 40).sum() > 100, "no black last window"
     assert ((drawn.min(axis=-1) > 200)[100:-100]).sum() > 500, "no white points"
+
+
+def test_the_axes_of_a_map_begin_at_the_first_camera(finished_run: Path) -> None:
+    """Wherever its world does: after a start that needed some frames, or with the poses of another system."""
+    usual, moved = RunFolder(finished_run), RunFolder(finished_run)
+    offset = np.array([100.0, -20.0, 7.0])
+    poses = usual.trajectory.world_from_cam.copy()
+    poses[:, :3, 3] += offset
+    vars(moved)["trajectory"] = replace(usual.trajectory, world_from_cam=poses)
+    vars(moved)["map"] = replace(usual.map, xyz=usual.map.xyz + offset)
+    pictures = [
+        cv2.imdecode(np.frombuffer(map_png(run), np.uint8), cv2.IMREAD_COLOR).astype(int) for run in (usual, moved)
+    ]
+    assert pictures[0].shape == pictures[1].shape
+    assert np.abs(pictures[0] - pictures[1]).mean() < 0.5
+
+
+@pytest.mark.parametrize("size", [(320, 240), (5312, 2988), (3000, 8192), (16384, 16384)])
+def test_points_of_wide_pictures_fit_into_two_bytes(size: tuple[int, int]) -> None:
+    parts = pixel_parts(*size)
+    assert 1 <= parts <= 16
+    assert parts * (max(size) - 0.5) <= 65535.5
+    assert parts == 16 or (parts + 1) * max(size) > 65536
 
 
 @pytest.mark.parametrize("scale_to", [64, 256])
