@@ -304,6 +304,8 @@ def test_a_true_path_with_gaps_is_as_long_as_it_is() -> None:
         assert path is not None
         assert (np.isfinite(path.errors) == np.isfinite(poses[:, 0, 0])).all()
         found.append(path.ate_percent)
+        drawn = np.isfinite(path.drawn()[:, 0])
+        assert drawn[:59].all() if without.step == 2 else (drawn == np.isfinite(path.errors)).all()
     np.testing.assert_allclose(found, 100 * 0.004 * np.sqrt(3) / 1.505, rtol=0.2)
 
 

@@ -116,7 +116,7 @@ def map_png(
 
     truth = true_path(run)
     if truth is not None:
-        true_2d = axes_of_world.project(truth.centers - first)
+        true_2d = axes_of_world.project(truth.drawn() - first)
         for number in np.unique(trajectory.segment):
             axis.plot(
                 *np.where((trajectory.segment == number)[:, None], true_2d, np.nan).T,
@@ -126,7 +126,14 @@ def map_png(
                 zorder=8,
                 label="true path, aligned" if number == trajectory.segment[0] else None,
             )
-        axis.legend(loc="best", fontsize=8, facecolor=_BACKGROUND, labelcolor="white", framealpha=0.8)
+        is_below = float(np.median(path_2d[:, 1])) < (low[1] + high[1]) / 2  # where the path is, the legend is not
+        axis.legend(
+            loc="upper left" if is_below else "lower left",
+            fontsize=8,
+            facecolor=_BACKGROUND,
+            labelcolor="white",
+            framealpha=0.8,
+        )
 
     axis.set_xlim(low[0], high[0])
     axis.set_ylim(low[1], high[1])

@@ -50,7 +50,7 @@ def scene_data(run: RunFolder, palette: Palette, truth: TruePath | None = None) 
             "labels": _layer(label_points, palette.label_colours(run.points.stability[label_rows])),
         },
         "poses": _base64(poses.astype("<f4")),
-        "truth": None if truth is None else _base64((truth.centers @ scene_from_world.T).astype("<f4")),
+        "truth": None if truth is None else _base64((truth.drawn() @ scene_from_world.T).astype("<f4")),
         "frame_indices": run.frame_indices.tolist(),
         "segments": trajectory.segment.tolist(),
         "doubted": (run.doubtful | run.uncertain).tolist(),
