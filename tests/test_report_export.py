@@ -272,6 +272,8 @@ def test_segments_are_models_of_their_own_the_longest_first(
     assert "frame_000017.png" in images[0]
     assert "frame_000018.png" in images[1]
     assert not (tmp_path / "c" / "images").exists()
+    assert main(["export", "colmap", str(finished_run), "-o", str(tmp_path / "c"), "--no-images"]) == 0
+    assert [path.name for path in (tmp_path / "c" / "sparse").iterdir()] == ["0"]  # nothing of the first export
     capsys.readouterr()
     assert main(["export", "nerfstudio", str(run), "-o", str(tmp_path / "n")]) == 0
     assert "only the longest of 2 segments: 12 frames" in capsys.readouterr().out

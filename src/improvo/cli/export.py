@@ -39,6 +39,7 @@ def run_colmap(arguments: argparse.Namespace) -> None:
     segments = segments_by_length(run_folder)
     models = [segment_model(run_folder, each, arguments.max_error, arguments.min_observations) for each in segments]
     make_output_folder(arguments.output, "export colmap")
+    _clear_models(arguments.output / "sparse")
     written = []
     for number, model in enumerate(models):
         colours = None if arguments.no_images else _write_images(run_folder, model, arguments.output / "images")
@@ -154,6 +155,15 @@ def _add_model_arguments(parser: argparse.ArgumentParser, contents: str) -> None
     parser.add_argument("--max-error", type=float, default=4.0, metavar="PIXELS", help="drop observations beyond this")
     parser.add_argument("--min-observations", type=int, default=3, metavar="N", help="drop points with fewer")
     add_recording(parser)
+
+
+def _clear_models(folder: Path) -> None:
+    """Remove the models of an earlier export, which may have had more segments."""
+    import shutil
+
+    for model in folder.glob("*"):
+        if model.name.isdecimal() and not model.is_symlink():
+            shutil.rmtree(model, ignore_errors=True)
 
 
 def _check_model_arguments(arguments: argparse.Namespace) -> None:
