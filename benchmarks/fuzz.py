@@ -23,6 +23,8 @@ import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from copy import deepcopy
+from functools import lru_cache
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -162,6 +164,7 @@ def turn(name: str, first: int, count: int, shared: Any, results: Connection, en
     sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
     os.dup2(sys.stdout.fileno(), 2)
     target = targets()[name]
+    remember_yaml()
     with tempfile.TemporaryDirectory(prefix="improvo-fuzz-", dir=SCRATCH) as place:
         example = Example(target, Path(place) / "example")
         before = time.process_time()  # making the example does not count
@@ -173,6 +176,32 @@ def turn(name: str, first: int, count: int, shared: Any, results: Connection, en
             shared[1] = time.process_time() - before
             if fault:
                 results.send((fault, seed))
+
+
+def remember_yaml() -> None:
+    """Parse a YAML text once: the files beside the damaged one are the same every time, and take most of the time."""
+    from ruamel.yaml import YAML  # what rosbags reads the metadata of a bag with
+
+    from improvo.untrusted import text
+
+    parse, ruamel_load = text.load_yaml, YAML.load
+    parsed = lru_cache(maxsize=64)(parse)
+    loaded = lru_cache(maxsize=64)(lambda kind, content: ruamel_load(YAML(typ=kind), content))
+
+    def load_yaml(content: str) -> Any:
+        return deepcopy(parsed(content))
+
+    def load(self: YAML, stream: Any) -> Any:
+        return (
+            deepcopy(loaded("safe", stream))
+            if isinstance(stream, str) and self.typ == ["safe"]
+            else ruamel_load(self, stream)
+        )
+
+    YAML.load = load  # type: ignore[method-assign]
+    for module in [one for name, one in sys.modules.items() if name.startswith(PACKAGE)]:
+        if getattr(module, "load_yaml", None) is parse:
+            module.load_yaml = load_yaml  # type: ignore[attr-defined]
 
 
 def processor_seconds(pid: int | None) -> float:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -271,9 +271,11 @@ def _training_targets() -> dict[str, Target]:
         from training_examples import tiny_trainer
     except ImportError:
         return {}
+    from improvo.training.metrics import METRICS, keep_metrics
     from improvo.training.pack import read_pack, write_pack
     from improvo.training.pictures import Pictures, Source
     from improvo.training.posed import PosedSequence
+    from improvo.training.trainer import Trainer
 
     def checkpoint(folder: Path) -> Path:
         tiny_trainer(folder).run(progress=False)
@@ -288,12 +290,14 @@ def _training_targets() -> dict[str, Target]:
         write_pack(folder / "pack.zip", Pictures((source,)), [posed], [])
         return folder / "pack.zip"
 
+    @cache
+    def trainer(folder: Path) -> Trainer:
+        return tiny_trainer(folder)
+
     return {
-        "checkpoint.pt": Target(checkpoint, lambda path: tiny_trainer(path.parent).resume()),
+        "checkpoint.pt": Target(checkpoint, lambda path: trainer(path.parent).resume()),
         "metrics.jsonl": Target(
-            lambda folder: checkpoint(folder).with_name("metrics.jsonl"),
-            lambda path: tiny_trainer(path.parent).resume(),
-            True,
+            lambda folder: checkpoint(folder).with_name(METRICS), lambda path: keep_metrics(path, 1), True
         ),
         "pack.zip": Target(pack, read_pack),
     }
@@ -354,7 +358,7 @@ def _own_targets() -> dict[str, Target]:
     from labeled_scene import write_labeled_scene
 
     def store(name: str, folder: Path) -> Path:
-        return write_labeled_scene(folder / "labels") / name
+        return write_labeled_scene(folder / "labels", frames=4, every=40) / name
 
     def read_store(path: Path) -> None:
         for one in read_labels(next(parent for parent in path.parents if parent.name == "labels")):

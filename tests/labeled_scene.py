@@ -37,8 +37,10 @@ def write_labeled_scene(
     keypoint_noise: float = 0.0,
     unstable_error: float = 4.0,
     wrong_link: bool = False,
+    frames: int = FRAMES,
+    every: int = 1,
 ) -> Path:
-    """A label store with one finished, packed sequence of `FRAMES` frames; returns the store.
+    """A label store with one finished, packed sequence, with a track of every `every`-th dot; returns the store.
 
     Unstable dots glide along their wall as the frames go by; with `wrong_link` their tracks jump once instead.
     """
@@ -47,13 +49,13 @@ def write_labeled_scene(
     store = LabelStore(folder, {"sequence": to_dict(SequenceSettings()), "labels": to_dict(LabelSettings())})
     partial = store.partial(name)
     partial.mkdir()
-    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
-    poses[:, 0, 3] = [camera_x(frame) for frame in range(FRAMES)]
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 0, 3] = [camera_x(frame) for frame in range(frames)]
     rows: list[tuple[int, int, float, float]] = []
     tracks: list[tuple[int, int, int]] = []  # track, point, observations
-    for point in range(len(xyz)):
+    for point in range(0, len(xyz), every):
         for span in spans(point):
-            seen = [(frame, *project(xyz[point], frame)) for frame in span]
+            seen = [(frame, *project(xyz[point], frame)) for frame in span if frame < frames]
             seen = [row for row in seen if 0 <= row[1] <= CAMERA.width - 1 and 0 <= row[2] <= CAMERA.height - 1]
             if len(seen) < 2:
                 continue
@@ -85,19 +87,19 @@ def write_labeled_scene(
                 withheld=np.zeros(len(tracks), np.bool_),
             )
         )  # fmt: skip
-    frames = np.arange(FRAMES)
-    times = frames / 30
+    numbers = np.arange(frames)
+    times = numbers / 30
     write_frames(
-        partial / FRAMES_FILE, FramesTable(frames, frames, times, np.zeros(FRAMES, int), np.ones(FRAMES, np.bool_))
+        partial / FRAMES_FILE, FramesTable(numbers, numbers, times, np.zeros(frames, int), np.ones(frames, np.bool_))
     )
     write_trajectory(partial / "trajectory.txt", Trajectory(times, poses))
     (partial / "run.json").write_text(json.dumps({"camera": to_dict(CAMERA)}))
-    pack_images(partial, [(draw(frame), None) for frame in range(FRAMES)])
+    pack_images(partial, [(draw(frame), None) for frame in range(frames)])
     counts = {"stable": int((stability == STABLE).sum()), "unstable": int((stability == UNSTABLE).sum())}
     finish_sequence(
         store.folder,
         SequenceRecord(
-            name, "/nowhere", DONE, frames=FRAMES, tracked=FRAMES, tracks=len(tracks), packed=True, **counts
+            name, "/nowhere", DONE, frames=frames, tracked=frames, tracks=len(tracks), packed=True, **counts
         ),
     )
     store.refresh_manifest()

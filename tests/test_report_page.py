@@ -243,6 +243,37 @@ def test_chart_leaves_gaps_where_there_is_nothing() -> None:
     assert line_chart(x, np.full(10, np.nan), "nothing").count("<polyline") == 0
 
 
+def test_chart_shows_a_value_that_stands_alone() -> None:
+    """One frame, or one with a pose between frames that have none."""
+    assert line_chart(np.zeros(1), np.ones(1), "one").count("<circle") == 1
+    svg = line_chart(np.arange(5.0), np.array([1.0, 2.0, np.nan, 4.0, np.nan]), "some")
+    assert (svg.count("<polyline"), svg.count("<circle")) == (1, 1)
+    assert '<circle cx="687.0" cy="28.0"' in svg
+
+
+@pytest.mark.parametrize("last", [6, 8, 11, 29, 1000])
+def test_chart_writes_numbers_where_they_stand(last: int) -> None:
+    x = np.arange(last + 1.0)
+    svg = line_chart(x, x, "the diagonal")
+    (points,) = re.findall(r'points="([^"]*)"', svg)
+    column_of = {number: point.split(",")[0] for number, point in enumerate(points.split())}
+    written = re.findall(r'<text x="([0-9.]+)" y="176" text-anchor="[a-z]+">([0-9]+)</text>', svg)
+    assert len(written) == 6
+    assert all(column_of[int(number)] == column for column, number in written)
+
+
+@pytest.mark.parametrize("y", [[0.0, 0.0], [-1.0, -2.0], [1e-320, 0.0], [np.inf, 1.0], [1e-10, 2e-10]])
+def test_chart_of_any_values_has_a_few_lines(y: list[float]) -> None:
+    assert 3 <= line_chart(np.arange(2.0), np.array(y), "values").count("<line") <= 6
+
+
+def test_a_damaged_table_of_an_evaluation_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "vo.json").write_text('{"rows": [1]}')
+    (tmp_path / "vo.md").write_bytes(b"# Table\xff\xfe")
+    assert main(["report", str(tmp_path)]) == 2
+    assert "vo.md: is damaged (" in capsys.readouterr().err
+
+
 def test_an_evaluation_page_has_its_tables_and_meaning(tmp_path: Path) -> None:
     (tmp_path / "vo.json").write_text('{"rows": [1]}')
     (tmp_path / "vo.md").write_text("# Table\n\n- one < two\n\n| a | b |\n|---|--:|\n| sift | **.5** |\n")

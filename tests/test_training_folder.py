@@ -140,7 +140,7 @@ def test_rows_of_metrics(tmp_path: Path) -> None:
     for step in (1, 2, 3):
         append_metrics(path, {"step": step, "loss": 1.5})
     with path.open("a") as stream:
-        stream.write('[1, 2]\n{"loss": 3}\n{"step": 4, "lo')
+        stream.write("[" * 100_000 + '\n[1, 2]\n{"loss": 3}\n{"step": 4, "lo')
     assert [row["step"] for row in read_metrics(path)] == [1, 2, 3]
     keep_metrics(path, 2)
     assert path.read_text() == '{"step": 1, "loss": 1.5}\n{"step": 2, "loss": 1.5}\n'

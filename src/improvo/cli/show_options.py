@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 _EVENLY = "6"  # frames of a sheet
 _MANY = 20  # frames that deserve a progress bar
+_FASTEST = 1000.0  # pictures a second of a video
 _LARGEST_SHEET = 60  # frames; more become files of their own
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 MOVING = (".mp4", ".webm", ".gif", ".webp")  # suffixes of `improvo.report.sheets`, which loads more
@@ -28,10 +29,14 @@ def add_run_folder(parser: argparse.ArgumentParser, made_by: str = "run") -> Non
     parser.add_argument("folder", type=Path, metavar="OUT", help=f"output folder of `improvo {made_by}`")
 
 
-def add_recording(parser: argparse.ArgumentParser) -> None:
-    """Where the recording of a run is now."""
+def add_recording(parser: argparse.ArgumentParser, name: str = "sequence") -> None:
+    """Where the recording of a run is now, as the argument `name`."""
     parser.add_argument(
-        "--sequence", type=Path, metavar="PATH", help="where the recording is now (default: where it was)"
+        "--sequence",
+        dest=name,
+        type=Path,
+        metavar="PATH",
+        help="where the recording of a run is now (default: where it was)",
     )
 
 
@@ -70,6 +75,8 @@ def asked_frames(arguments: argparse.Namespace, count: int) -> list[int]:
     output: Path | None = arguments.output
     if arguments.video_width is not None and arguments.video_width < 16:
         raise ConfigError(f"--video-width {arguments.video_width}: must be at least 16 pixels")
+    if arguments.video_fps is not None and not 0 < arguments.video_fps <= _FASTEST:
+        raise ConfigError(f"--video-fps {arguments.video_fps:g}: must be positive, and at most {_FASTEST:g}")
     if output is None or not output.suffix or video:
         return frames
     if arguments.each or len(frames) > _LARGEST_SHEET:

@@ -8,7 +8,7 @@ from typing import Any
 
 from improvo.errors import InputError
 from improvo.report.page import Page
-from improvo.untrusted.text import read_json_file
+from improvo.untrusted.text import read_json_file, reason
 
 # evaluation -> (title, what the numbers mean)
 EVALUATIONS = {
@@ -64,10 +64,14 @@ def write_evaluation_page(folder: Path, path: Path) -> None:
 
 
 def _tables(page: Page, folder: Path, name: str) -> None:
+    path, mend = folder / f"{name}.md", f"run `improvo evaluate {name}` again"
     try:
-        page.markdown((folder / f"{name}.md").read_text())
-    except OSError:
-        raise InputError(f"{folder / name}.md: is missing; run `improvo evaluate {name}` again") from None
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: is missing; {mend}") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: is damaged ({reason(error)}); {mend}") from None
+    page.markdown(text)
 
 
 def _subject(path: Path) -> str:

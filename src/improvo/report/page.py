@@ -173,7 +173,7 @@ def _embedded(content: bytes | Path) -> str:
 
 
 def _asset(name: str) -> str:
-    return files("improvo.report").joinpath("assets", name).read_text()
+    return files("improvo.report").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def _cell(text: str) -> str:

@@ -101,7 +101,7 @@ def _find(
         if known is not None and _is_of(known, request):
             if known != target:
                 for suffix in (".yaml", ".json"):
-                    write_text(target.with_suffix(suffix), known.with_suffix(suffix).read_text())
+                    write_text(target.with_suffix(suffix), known.with_suffix(suffix).read_text(encoding="utf-8"))
             on_found(path, None)
             return
     found = camera_from_motion(path, how, told)

@@ -37,9 +37,9 @@ class SimulationSettings:
 
     # the hand that holds the camera
     speed: float = 0.35  # metres per second along the path
-    turn: float = 25.0  # degrees per second, largest rate of looking around
-    hand_jitter: float = 1.0  # 1 is an ordinary hand: about 3 mm and 0.4 degrees
-    walking_bob: float = 0.012  # height of a step
+    turn: float = 25.0  # degrees per second from one look to the next, at most; half as much again on the way
+    hand_jitter: float = 1.0  # 1 is an ordinary hand: 3 mm along and 0.3 degrees about each axis, standard deviation
+    walking_bob: float = 0.012  # by which a step lifts and lowers the camera
 
     # light and sensor
     brightness: float = 1.0

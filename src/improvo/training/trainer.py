@@ -92,10 +92,9 @@ class Trainer:
         share_batch_norm(self.stage)
         self.average = deepcopy(self.stage).requires_grad_(False)
         self.batches, self.settings, self.folder, self.allowed = batches, settings, folder, seconds
+        trained = self.stage.state_dict()
         self._averaged = [
-            (value, self.stage.state_dict()[name])
-            for name, value in self.average.state_dict().items()
-            if value.is_floating_point()
+            (value, trained[name]) for name, value in self.average.state_dict().items() if value.is_floating_point()
         ]
         decayed = [p for p in stage.parameters() if p.ndim > 1]
         others = [p for p in stage.parameters() if p.ndim <= 1]
