@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -136,6 +137,28 @@ def test_video_keeps_its_colours(tmp_path: Path) -> None:
     ok, frame = cv2.VideoCapture(str(tmp_path / "red.mp4")).read()
     assert ok
     np.testing.assert_allclose(frame.reshape(-1, 3).mean(axis=0), [0, 0, 220], atol=25)
+
+
+@pytest.mark.parametrize("fps", [0.5, 15.0, 24.0, 30.0, 60.0, 119.88])
+@pytest.mark.parametrize("suffix", [".gif", ".webp", ".mp4", ".webm"])
+def test_a_moving_picture_lasts_as_long_as_it_should(tmp_path: Path, suffix: str, fps: float, capfd: Any) -> None:
+    """A GIF counts in hundredths of a second, and browsers refuse to show one faster than every second of them."""
+    path = tmp_path / f"moving{suffix}"
+    write_video(path, (np.full((20, 32, 3), 40 * (number % 6), np.uint8) for number in range(24)), fps)
+    assert capfd.readouterr().err == ""
+    if suffix in (".mp4", ".webm"):
+        video = cv2.VideoCapture(str(path))
+        assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(fps, rel=0.001)
+        assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 24
+        return
+    with Image.open(path) as image:
+        durations = []
+        for number in range(image.n_frames):
+            image.seek(number)
+            image.load()
+            durations.append(image.info["duration"])
+    assert sum(durations) == pytest.approx(24000 / fps, abs=20)
+    assert min(durations) >= (20 if suffix == ".gif" else 0)
 
 
 def test_a_recording_that_moved_is_named_with_its_mend(

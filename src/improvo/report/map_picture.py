@@ -88,7 +88,8 @@ def map_png(
 
     links = np.stack([path_2d[:-1], path_2d[1:]], axis=1)
     joined = trajectory.segment[:-1] == trajectory.segment[1:]
-    colours = palette.ramp_colours(run.frame_indices[1:].astype(float), 0, max(run.frames - 1, 1)) / 255.0
+    of_poses = palette.ramp_colours(run.frame_indices.astype(float), 0, max(run.frames - 1, 1)) / 255.0
+    colours = of_poses[1:]
     axis.add_collection(
         LineCollection(list(links[joined]), colors=colours[joined], linewidths=3.0, capstyle="round", zorder=3)
     )
@@ -102,7 +103,7 @@ def map_png(
     last = path_2d[-last_poses:]
     axis.plot(*last.T, color="white", linewidth=5.5, solid_capstyle="round", zorder=4)
     axis.plot(*last.T, color="black", linewidth=3.5, solid_capstyle="round", zorder=5)
-    axis.plot(*path_2d[0], "o", color=tuple(colours[0]), markeredgecolor="white", markersize=8, zorder=6)
+    axis.plot(*path_2d[0], "o", color=tuple(of_poses[0]), markeredgecolor="white", markersize=8, zorder=6)
     axis.annotate("start", path_2d[0], (6, 6), textcoords="offset points", color="white", fontsize=9, zorder=7)
     for number in np.unique(trajectory.segment)[1:]:
         first = path_2d[np.flatnonzero(trajectory.segment == number)[0]]

@@ -39,7 +39,7 @@ def true_path(run: RunFolder) -> TruePath | None:
         return None
     rows = np.searchsorted(run.sequence.indices, np.array(run.source_index)[run.frame_indices])
     wanted = truth.camera_centers[np.minimum(rows, len(truth) - 1)]
-    centers = np.full_like(wanted, np.nan)
+    centers, length = np.full_like(wanted, np.nan), 0.0
     known = np.isfinite(wanted).all(axis=1)
     for segment in np.unique(trajectory.segment).tolist():
         here = np.flatnonzero((trajectory.segment == segment) & known)
@@ -47,9 +47,9 @@ def true_path(run: RunFolder) -> TruePath | None:
         if len(here) < _FEWEST or np.ptp(wanted[here], axis=0).max() == 0 or np.ptp(estimate, axis=0).max() == 0:
             continue
         centers[here] = align_points(estimate, wanted[here], with_scale=True).apply(wanted[here])
+        # from one known place to the next, also where there is no truth between them
+        length += float(np.linalg.norm(np.diff(centers[here], axis=0), axis=1).sum())
     errors = np.linalg.norm(trajectory.camera_centers - centers, axis=1)
-    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)[np.diff(trajectory.segment) == 0]
-    length = float(np.nansum(steps))
     if not np.isfinite(errors).any() or length == 0:
         return None
     return TruePath(centers, errors, 100.0 * float(np.sqrt(np.nanmean(errors**2))) / length)
