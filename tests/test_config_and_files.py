@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from improvo import config
+from improvo import config, files
 from improvo.cli.main import main
 from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
 from improvo.depth.run_settings import DenseRunSettings
@@ -180,6 +180,13 @@ def test_a_failed_write_leaves_the_old_file_and_no_temporary(tmp_path: Path) -> 
         fail_half_way()
     assert path.read_text() == "old"
     assert [each.name for each in tmp_path.iterdir()] == ["result.txt"]
+
+
+@pytest.mark.parametrize("name", ["厨" * 80 + ".txt", "\udcff" * 100 + ".txt", "a" * 251 + ".txt"])
+def test_a_name_as_long_as_the_system_takes_is_written(tmp_path: Path, name: str) -> None:
+    write_text(tmp_path / name, "here")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert files._TEMPORARY.fullmatch(files.temporary_name(name, ".txt"))  # is cleared where its process was killed
 
 
 def test_json_never_holds_nan(tmp_path: Path) -> None:

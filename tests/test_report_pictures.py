@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +17,9 @@ from improvo.cli.main import main
 from improvo.geometry.se3 import rigid, so3_exp
 from improvo.odometry.run_folder import RunFolder
 from improvo.report.canvas import Canvas, captioned
+from improvo.report.map_picture import map_png
 from improvo.report.overhead import overhead_axes, robust_limits
+from improvo.report.page_data import pixel_parts
 from improvo.report.palettes import PALETTES
 from improvo.report.sheets import write_video
 from improvo.report.stability_picture import suppressed_regions
@@ -72,6 +76,29 @@ def test_map_has_white_points_a_jet_trajectory_and_a_black_last_window(finished_
     assert ((green > 180) & (blue > 60) & (red < 200) & (abs(red - green) > 40)).sum() > 20, "no middle of the ramp"
     assert (drawn.max(axis=-1) < 40).sum() > 100, "no black last window"
     assert ((drawn.min(axis=-1) > 200)[100:-100]).sum() > 500, "no white points"
+
+
+def test_the_axes_of_a_map_begin_at_the_first_camera(finished_run: Path) -> None:
+    """Wherever its world does: after a start that needed some frames, or with the poses of another system."""
+    usual, moved = RunFolder(finished_run), RunFolder(finished_run)
+    offset = np.array([100.0, -20.0, 7.0])
+    poses = usual.trajectory.world_from_cam.copy()
+    poses[:, :3, 3] += offset
+    vars(moved)["trajectory"] = replace(usual.trajectory, world_from_cam=poses)
+    vars(moved)["map"] = replace(usual.map, xyz=usual.map.xyz + offset)
+    pictures = [
+        cv2.imdecode(np.frombuffer(map_png(run), np.uint8), cv2.IMREAD_COLOR).astype(int) for run in (usual, moved)
+    ]
+    assert pictures[0].shape == pictures[1].shape
+    assert np.abs(pictures[0] - pictures[1]).mean() < 0.5
+
+
+@pytest.mark.parametrize("size", [(320, 240), (5312, 2988), (3000, 8192), (16384, 16384)])
+def test_points_of_wide_pictures_fit_into_two_bytes(size: tuple[int, int]) -> None:
+    parts = pixel_parts(*size)
+    assert 1 <= parts <= 16
+    assert parts * (max(size) - 0.5) <= 65535.5
+    assert parts == 16 or (parts + 1) * max(size) > 65536
 
 
 @pytest.mark.parametrize("scale_to", [64, 256])
@@ -136,6 +163,28 @@ def test_video_keeps_its_colours(tmp_path: Path) -> None:
     ok, frame = cv2.VideoCapture(str(tmp_path / "red.mp4")).read()
     assert ok
     np.testing.assert_allclose(frame.reshape(-1, 3).mean(axis=0), [0, 0, 220], atol=25)
+
+
+@pytest.mark.parametrize("fps", [0.5, 15.0, 24.0, 30.0, 60.0, 119.88])
+@pytest.mark.parametrize("suffix", [".gif", ".webp", ".mp4", ".webm"])
+def test_a_moving_picture_lasts_as_long_as_it_should(tmp_path: Path, suffix: str, fps: float, capfd: Any) -> None:
+    """A GIF counts in hundredths of a second, and browsers refuse to show one faster than every second of them."""
+    path = tmp_path / f"moving{suffix}"
+    write_video(path, (np.full((20, 32, 3), 40 * (number % 6), np.uint8) for number in range(24)), fps)
+    assert capfd.readouterr().err == ""
+    if suffix in (".mp4", ".webm"):
+        video = cv2.VideoCapture(str(path))
+        assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(fps, rel=0.001)
+        assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 24
+        return
+    with Image.open(path) as image:
+        durations = []
+        for number in range(image.n_frames):
+            image.seek(number)
+            image.load()
+            durations.append(image.info["duration"])
+    assert sum(durations) == pytest.approx(24000 / fps, abs=20)
+    assert min(durations) >= (20 if suffix == ".gif" else 0)
 
 
 def test_a_recording_that_moved_is_named_with_its_mend(

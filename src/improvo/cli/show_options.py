@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from improvo.cli.output import say
-from improvo.errors import ConfigError, OutputError
+from improvo.errors import ConfigError, InputError, OutputError
 from improvo.files import check_output_file
 from improvo.terminal import counted
 
@@ -70,6 +70,8 @@ def add_frames(parser: argparse.ArgumentParser) -> None:
 def asked_frames(arguments: argparse.Namespace, count: int) -> list[int]:
     """The frames that the arguments of `add_frames` name, of `count`; what they say of the output is checked too."""
     video = _is_video(arguments)
+    if count == 0:
+        raise InputError(f"{vars(arguments).get('folder') or arguments.sequence}: has no frames to draw")
     which = "all" if video and arguments.frames == _EVENLY else arguments.frames
     frames = chosen_frames(which, count)
     output: Path | None = arguments.output

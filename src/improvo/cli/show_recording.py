@@ -51,7 +51,7 @@ def run_stability(arguments: argparse.Namespace) -> None:
     colours, shown_name = palette(arguments.palette), Path(name).stem
     frames = asked_frames(arguments, len(sequence))
     times = sequence.times
-    fps = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 30.0
+    fps = float((len(times) - 1) / (times[-1] - times[0])) if len(times) > 1 and times[-1] > times[0] else 30.0
 
     def painted(number: int) -> UInt8:
         frame = sequence[number]

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from improvo.errors import InputError
-from improvo.report.page import Page
+from improvo.report.page import Page, as_json
 from improvo.untrusted.text import read_json_file, reason
 
 # evaluation -> (title, what the numbers mean)
@@ -104,5 +103,5 @@ _LONGEST = 200_000  # characters of a result that are worth embedding
 
 
 def _indented(path: Path) -> str:
-    text = json.dumps(_read(path), indent=1)
+    text = as_json(_read(path))
     return text if len(text) <= _LONGEST else text[:_LONGEST] + f"\n... {len(text) - _LONGEST} more characters"
