@@ -94,9 +94,7 @@ class Trainer:
         self.batches, self.settings, self.folder, self.allowed = batches, settings, folder, seconds
         trained = self.stage.state_dict()
         self._averaged = [
-            (value, trained[name])
-            for name, value in self.average.state_dict().items()
-            if value.is_floating_point()
+            (value, trained[name]) for name, value in self.average.state_dict().items() if value.is_floating_point()
         ]
         decayed = [p for p in stage.parameters() if p.ndim > 1]
         others = [p for p in stage.parameters() if p.ndim <= 1]
