@@ -35,7 +35,7 @@ class Bridging:
     """Looks for the former maps in the views of a new one.
 
     Args:
-        settings: of the odometry; `bridging` says how long, `verdict.max_error` how sure, and `start.min_points` how much.
+        settings: of the odometry; `bridging` says how long, `verdict.max_error` and `start.min_points` how sure.
     """
 
     def __init__(self, settings: OdometrySettings) -> None:
