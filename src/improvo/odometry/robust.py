@@ -148,7 +148,9 @@ class RobustMapper(Mapper):
             self._judge.alarm(f"the focal length is about {self._lens.factor:.2f} times that of the camera as given")
         if self._contradicted:
             maps = "a former map" if self._contradicted == 1 else f"each of {self._contradicted} former maps"
-            self._judge.suspicion(f"{maps} of these frames was contradicted by {_TWO_VIEWS}", self._contradicted)
+            words = f"{maps} of these frames was contradicted by {_TWO_VIEWS}"
+            # one was worse than the map that followed; several in a row tell that these frames mislead
+            self._judge.suspicion(words, self._contradicted if self._contradicted > 1 else 0)
         self._second_opinion.on_dropped(self._buffer)
         self._result.begin_segment()
         self._result.give_up(each for each in self._buffer if each.cam_from_world is None)
