@@ -32,7 +32,7 @@ from typing import Any
 from fuzz_targets import EXPECTED, Target, targets  # of the tests: run with PYTHONPATH=tests
 from mutations import mutated
 
-SECONDS, MEGABYTES = 20.0, 4000  # of one execution (processor time), of a child process
+SECONDS, MEGABYTES = 20.0, 4000  # of one execution (processor time), of a child process with its imports
 WAITING_SECONDS = 900.0  # of an execution that does nothing
 TURN_SECONDS = 30.0  # executions of one child; a new one costs a fork and a new example
 PACKAGE = "improvo"
@@ -272,7 +272,7 @@ def time_limit() -> Iterator[None]:
 
 
 def limit_memory() -> None:
-    """No more address space than this beyond what the imports take."""
+    """No more address space than this in all: of that, the imports take one part and the files the rest."""
     import resource
 
     resource.setrlimit(resource.RLIMIT_AS, (MEGABYTES << 20, MEGABYTES << 20))

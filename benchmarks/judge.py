@@ -4,9 +4,9 @@
     python benchmarks/judge.py OUT... --only --frontend before=superpoint-small --frontend after=FILE
 
 `OUT` are folders of `improvo improve`: each has a reference run with depth, and what was held back. For every candidate
-the share of right matches (3 and 8 px) of the frames held back, by the reference, and by true poses and depth where the
-recording has them, and their number; then, for each recording and gap, and all gaps together, the rank correlation
-(Spearman) of the two over the candidates.
+the share of right matches (3 and 8 px) of the frames held back, by the reference, and by the recording's own poses and
+depth images where it has them, and their number; then, for each recording and gap, and all gaps together, the rank
+correlation (Spearman) of the two over the candidates.
 Candidates are the bundled weights, those given, and, without `--only`, sums and spoiled ones of `superpoint-small`.
 With `--only` it compares: every row with the first, with 95 % intervals (bootstrap over pairs), and the correlations of
 those given where there are ten and more.
@@ -19,6 +19,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
+import hashlib
 import json
 import tempfile
 from collections.abc import Callable
@@ -33,6 +34,7 @@ from scipy.stats import spearmanr
 from improvo.evaluation.measures import PairGeometry, relative_motion, right_matches
 from improvo.evaluation.pose.self_truth import FixedRun, choose_pairs
 from improvo.evaluation.statistics import Bootstrap
+from improvo.files import content_hash
 from improvo.frontend.registry import load_frontend
 from improvo.frontend.weights import find_weights, load_weights
 from improvo.improvement.gaps import choose_gaps
@@ -40,14 +42,16 @@ from improvo.improvement.reference import HELD_BACK, ReferencePart, reference_pa
 from improvo.improvement.rounds import calibration_images, write_calibrated
 from improvo.improvement.settings import ValidationSettings
 from improvo.improvement.split import read_split
+from improvo.labeling.labeled import TRAJECTORY_FILE
 from improvo.sequences import open_sequence
 from improvo.tracking.matching import mutual_nearest_neighbours
-from improvo.types import Features, Int64
+from improvo.types import Features, Float32, Int64
 from judge_candidates import written
 
 LIMITS = (3.0, 8.0)
 KEYPOINTS = 500
 _FEWEST = 10  # candidates whose order says something
+_FEWEST_PAIRS = 5  # of a gap: resamples of one pair are all alike, which looks like certainty
 # "judge 90" -> of each pair, the share within each limit, then the number; a share also rises where wrong ones are lost
 Shares = dict[str, list[list[float]]]
 
@@ -93,32 +97,50 @@ def _set(part: ReferencePart, folder: Path, gaps: tuple[int, ...], most: int) ->
 def calibrated(name: str, weights: Path, folder: Path, keep: Path) -> Path:
     """Weights with activation ranges, which all others have: measured on frames that were trained on where missing.
 
-    They are kept under the candidate's name: files of different folders are often called the same.
+    They are kept by name and content: files of different folders are often called the same.
     """
     if load_weights(find_weights(str(weights))).card.activation_ranges:
         return weights
-    target = keep / f"{name.replace(' ', '-')}.safetensors"
+    target = keep / f"{_kept_name(name, weights)}.safetensors"
     if not target.is_file():
         write_calibrated(weights, target, calibration_images(read_split(folder / "split.json").training, 24))
     return target
 
 
 def _true_run(part: ReferencePart) -> FixedRun | None:
-    """True poses and depth images of the part's frames; None where the recording has none."""
-    sequence = open_sequence(Path(part.labeled.record.path))
+    """The recording's own poses and depth images of the part's frames; None where it has none."""
+    sequence = open_sequence(Path(part.labeled.record.path), part.labeled.settings)
     if sequence.ground_truth is None:
         return None
-    poses = np.full((len(sequence), 4, 4), np.nan)
-    rows = part.frames[sequence.ground_truth.valid[part.frames]]
-    poses[rows] = sequence.ground_truth.world_from_cam[rows]
-    has_depth = np.zeros(len(sequence), np.bool_)
-    for row in rows:
-        depth = sequence.depth(int(row))
-        has_depth[row] = depth is not None and bool((depth > 0).any())
+    in_sequence = np.searchsorted(sequence.indices, part.labeled.frames.source_index)  # by frame of the run
+    poses = np.full((len(in_sequence), 4, 4), np.nan)
+    frames = part.frames[sequence.ground_truth.valid[in_sequence[part.frames]]]
+    poses[frames] = sequence.ground_truth.world_from_cam[in_sequence[frames]]
+
+    def depth(frame: int) -> Float32 | None:
+        return sequence.depth(int(in_sequence[frame]))
+
+    has_depth = np.zeros(len(in_sequence), np.bool_)
+    for frame in frames.tolist():
+        found = depth(frame)
+        has_depth[frame] = found is not None and bool((found > 0).any())
     if not has_depth.any():
         return None
     segment = np.where(np.isfinite(poses).all(axis=(1, 2)), 0, -1)
-    return FixedRun(sequence.camera, poses, segment, has_depth, sequence.depth)
+    return FixedRun(sequence.camera, poses, segment, has_depth, depth)
+
+
+def scores_file(keep: Path, chosen: Set, name: str, weights: Path) -> Path:
+    """Where the shares of a candidate are kept: by its content, and by the recording, the run and the pairs."""
+    digest = hashlib.blake2b(chosen.part.labeled.folder.resolve().as_posix().encode(), digest_size=8)
+    digest.update(content_hash(chosen.part.labeled.folder / TRAJECTORY_FILE).encode())
+    for words, pairs in chosen.pairs.items():
+        digest.update(words.encode() + pairs.tobytes())
+    return keep / f"{chosen.part.name}-{digest.hexdigest()}" / f"{_kept_name(name, weights)}.scores.json"
+
+
+def _kept_name(name: str, weights: Path) -> str:
+    return f"{name.replace(' ', '-')}-{content_hash(find_weights(str(weights)))[:16]}"
 
 
 def shares(chosen: Set, weights: Path) -> Shares:
@@ -169,8 +191,11 @@ def _gain(before: Shares, after: Shares, gaps: list[str], column: int) -> str:
         difference = np.array(after[gap])[:, column] - np.array(before[gap])[:, column]
         resampled.append(Bootstrap(len(difference), number, 1000, 0.95).means(difference))
         differences.append(difference.mean())
+    gain = f"{100 * np.mean(differences) / base:+.1f} %"
+    if min(len(before[gap]) for gap in gaps) < _FEWEST_PAIRS:
+        return f"{gain} (too few pairs for an interval)"
     low, high = np.percentile(np.mean(resampled, axis=0), (2.5, 97.5))
-    return f"{100 * np.mean(differences) / base:+.1f} % ({100 * low / base:+.1f} to {100 * high / base:+.1f})"
+    return f"{gain} ({100 * low / base:+.1f} to {100 * high / base:+.1f})"
 
 
 def correlations(found: dict[str, Shares], spoiled: set[str]) -> None:
@@ -222,7 +247,7 @@ def main() -> None:
             for chosen in opened(folder, tuple(arguments.gaps), arguments.pairs):
                 found = {}
                 for name, path in candidates.items():
-                    file = keep / folder.name / f"{name.replace(' ', '-')}.scores.json"
+                    file = scores_file(keep, chosen, name, path)
                     if not file.is_file():
                         file.parent.mkdir(parents=True, exist_ok=True)
                         file.write_text(json.dumps(shares(chosen, calibrated(name, path, folder, file.parent))))

@@ -32,7 +32,7 @@ def match_errors(sequence: Sequence, frontend: Frontend, a: int, b: int) -> Floa
     first, second = frontend(sequence[a].image), frontend(sequence[b].image)
     matches = mutual_nearest_neighbours(first, second, None)
     places, found = first.keypoints[matches[:, 0]].astype(np.float64), second.keypoints[matches[:, 1]]
-    columns, rows = np.round(places).astype(np.int64).T
+    columns, rows = np.clip(np.round(places), 0, (depth.shape[1] - 1, depth.shape[0] - 1)).astype(np.int64).T
     points = sequence.camera.unproject(places) * depth[rows, columns][:, None]
     b_from_a = inverse(truth.world_from_cam[b]) @ truth.world_from_cam[a]
     expected = sequence.camera.project(transform(b_from_a, points))

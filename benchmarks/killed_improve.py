@@ -95,7 +95,7 @@ def compare(calm: Path, killed: Path) -> None:
     ours, theirs = contents(killed), contents(calm)
     left = [path.name for path in killed.rglob("*.partial*")]
     print(f"same labels and weights: {ours == theirs} ({len(theirs)} compared); half-written files: {left}", flush=True)
-    if ours != theirs or left:
+    if ours != theirs or left or not theirs:
         raise SystemExit(1)
 
 

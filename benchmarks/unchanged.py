@@ -233,7 +233,9 @@ def main() -> None:
         lines = list(compare(before, after))
         same = sum(before[name] == after.get(name) for name in before)
         print(*lines, f"{same} of {len(before.keys() | after.keys())} tasks with the same results", sep="\n")
-        sys.exit(1 if lines else 0)
+        if without := [name for name in tasks if name not in before and name not in after]:
+            print(f"without results in either: {', '.join(without)}")
+        sys.exit(1 if lines or not same else 0)
     runner = Runner(arguments)
     start = time.monotonic()
     chosen = {name: words for name, words in tasks.items() if arguments.again or name not in runner.results}

@@ -25,10 +25,14 @@ def combined(parts: list[tuple[str, Weights, float]]) -> Weights:
         parts: name, weights and factor of each; the first has all tensors, and its card is kept.
 
     Raises:
-        ConfigError: factors that do not sum to one, or a negative variance of a batch norm.
+        ConfigError: factors that do not sum to one, of a head that only some have to zero, a head that the first has
+            not, or a negative variance of a batch norm.
     """
     if abs(sum(factor for _, _, factor in parts) - 1) > 1e-6:
         raise ConfigError("factors: must sum to one")
+    left_out = {name for _, weights, _ in parts for name in weights.tensors} - set(parts[0][1].tensors)
+    if left_out:
+        raise ConfigError(f"{min(left_out)}: is not in the first file, whose layers the sum has; give another first")
     tensors = {}
     for name in parts[0][1].tensors:
         having = [
@@ -37,6 +41,8 @@ def combined(parts: list[tuple[str, Weights, float]]) -> Weights:
             if name in weights.tensors
         ]
         whole = sum(factor for _, factor in having)
+        if abs(whole) < 1e-6:
+            raise ConfigError(f"{name}: the factors of those that have it sum to zero; take others")
         tensors[name] = np.asarray(sum(values * (factor / whole) for values, factor in having), np.float32)
         if name.endswith("running_var") and tensors[name].min() < 0:
             raise ConfigError(f"{name}: negative; take a smaller factor")

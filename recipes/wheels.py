@@ -46,7 +46,8 @@ def main() -> None:
         for python in arguments.python:
             answer = resolved(requirements, platform, python)
             if answer and arguments.each:
-                answer = ", ".join(each for each in requirements if resolved([each], platform, python))
+                alone = ", ".join(each for each in requirements if resolved([each], platform, python))
+                answer = alone or f"{answer} (together)"
             cells.append(answer or "yes")
             bad |= bool(answer) and label.startswith(CLAIMED)
         print(f"| {label} |" + "".join(f" {cell} |" for cell in cells), flush=True)

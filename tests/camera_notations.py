@@ -178,7 +178,7 @@ ROS_ROI = f"""height: 960
 width: 1504
 distortion_model: plumb_bob
 d: {list(BROWN5)}
-k: [{2 * FX}, 0, {2 * CX}, 0, {2 * FY}, {2 * CY}, 0, 0, 1]
+k: [{2 * FX}, 0, {2 * CX + 0.5}, 0, {2 * FY}, {2 * CY + 0.5}, 0, 0, 1]
 binning_x: 2
 binning_y: 2
 roi: {{x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}}

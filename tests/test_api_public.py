@@ -106,6 +106,9 @@ def test_the_verbs_do_what_the_commands_do(tmp_path: Path) -> None:
     pose = improvo.PoseSettings(gaps=(5,), pairs=4, estimators=("poselib",))
     [cell] = improvo.evaluate_pose([bundled_sequence()], ["orb"], pose)
     assert (cell.frontend, cell.estimator, cell.gap, cell.pairs) == ("orb", "poselib", 5, 4)
+    in_seconds = improvo.PoseSettings(gap_seconds=(0.2,), pairs=4, estimators=("poselib",))
+    [cell] = improvo.evaluate_pose([bundled_sequence()], ["orb"], in_seconds)
+    assert cell.gap == 6
     assert 0 <= cell.rotation_interval[0] <= cell.rotation_success <= cell.rotation_interval[1] <= 1
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shlex
 import subprocess
@@ -253,6 +254,44 @@ def test_an_output_whose_name_is_no_text(walk: Path, tmp_path: Path, capsys: pyt
 
 
 # --- names
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(["run", "demo", "-o", "SECRET/out"], ["run", "SECRET/walk.mp4", "-o", "out"], ["info", "SECRET"]),
+        *(["run", "demo", "-o", "out", "--mask", "SECRET/mask.png"], ["report", "SECRET"], ["show", "map", "SECRET"]),
+        *(["run", "demo", "-o", "out", "--camera", "SECRET/camera.yaml"], ["weights", "show", "SECRET/w.safetensors"]),
+        *(["label", "SECRET", "-o", "out"], ["evaluate", "trajectory", "SECRET/a.txt", "demo"]),
+        *(["calibrate", "demo", "-o", "SECRET/c.yaml"], ["run", "demo", "-o", "out", "--config", "SECRET/c.yaml"]),
+    ],
+)
+def test_a_folder_that_may_not_be_looked_into_is_one_line(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Python raises where a path in such a folder is only asked whether it is there. Root may look into all of them."""
+    secret, look = tmp_path / "secret", os.stat
+    (secret / "deep").mkdir(parents=True)
+
+    def stat(path: Any, *others: Any, **options: Any) -> os.stat_result:
+        if isinstance(path, str | os.PathLike) and f"{secret}{os.sep}" in os.fspath(path):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return look(path, *others, **options)
+
+    if os.geteuid() == 0:
+        monkeypatch.setattr(os, "stat", stat)
+    else:
+        secret.chmod(0)
+    monkeypatch.chdir(tmp_path)
+    try:
+        assert main([word.replace("SECRET", str(secret / "deep")) for word in words]) == 2
+    finally:
+        monkeypatch.undo()
+        secret.chmod(0o700)
+    message = capsys.readouterr().err
+    assert message.startswith(f"improvo: {secret / 'deep'}")
+    assert message.count("\n") == 1
+    assert "ermission" in message
 
 
 def test_the_next_command_can_be_pasted_whatever_the_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

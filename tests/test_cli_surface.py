@@ -198,6 +198,19 @@ def test_progress_is_a_line_now_and_then_where_there_is_no_terminal(
     assert capsys.readouterr().err == ""
 
 
+def test_the_stages_of_a_second_recording_begin_anew(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(terminal, "INTERVAL", 0.0)
+    with terminal.stages("step") as told:
+        for _ in ("attic", "hall"):
+            for done in (1, 2, 3):
+                told("keypoints", done, 3)
+            told("adjusting", 2, 2)
+    said = [line.partition(" step")[0] for line in capsys.readouterr().err.splitlines()]
+    assert said == [*("keypoints: 1 of 3", "keypoints: 2 of 3", "keypoints: 3 of 3", "adjusting: 2 of 2")] * 2
+
+
 def test_settings_of_a_network_reach_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["run", str(bundled_sequence()), "-o", str(tmp_path / "out"), "--max-frames", "4"]
     network = ["--frontend", "superpoint-small", "--precision", "float32", "--threshold", "0.02"]

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 
-from improvo import config
+from improvo import config, files
+from improvo.cli.main import main
+from improvo.cli.options import add_config_arguments, add_sequence_arguments, settings_from
+from improvo.depth.run_settings import DenseRunSettings
 from improvo.errors import ConfigError, OutputError
 from improvo.files import (
     MARKER,
@@ -18,6 +22,8 @@ from improvo.files import (
     write_text,
     written_atomically,
 )
+from improvo.odometry.scale.settings import scale_settings
+from improvo.sequences.settings import InfoSettings
 
 
 @dataclass(frozen=True)
@@ -54,6 +60,43 @@ def test_what_is_printed_is_read_back(tmp_path: Path) -> None:
     settings = Outer(7, "there", Inner(0.25, ("p", "q")))
     path.write_text(config.to_yaml(settings))
     assert config.load(Outer, path) == settings
+
+
+WORDS = (
+    " ".join(["my recordings of the summer"] * 20),
+    "été " * 40,
+    "a\nb",
+    "a\n...\n",
+    'it\'s "so" \\ : # {',
+    "\udc80",
+    "",
+    "1e5",
+    "null",
+)
+
+
+@pytest.mark.parametrize("value", [*WORDS, list(WORDS), [0.25] * 60, 0.1, True, None, [["a\nb", 1]]])
+def test_a_value_of_any_length_is_one_line_and_read_back(value: object) -> None:
+    line = config.yaml_line(value)
+    assert len(line.splitlines()) == 1
+    assert config.load_yaml(line) == value
+
+
+@pytest.mark.parametrize("word", WORDS[:-3])
+def test_a_flag_gives_its_setting_the_word_that_was_typed(
+    word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A long path with spaces was cut off at its first 80 letters, and one with accents was refused."""
+    parser = argparse.ArgumentParser()
+    add_sequence_arguments(parser)
+    add_config_arguments(parser)
+    assert settings_from(InfoSettings, parser.parse_args(["--mask", word])).sequence.mask == word
+    assert main(["config", "info", "--set", f"sequence.mask={config.yaml_line(word)}"]) == 0
+    printed = tmp_path / "info.yaml"
+    printed.write_text(capsys.readouterr().out, encoding="utf-8")
+    assert config.load(InfoSettings, printed).sequence.mask == word
+    scale = config.load(DenseRunSettings, None, scale_settings([["truth", word]]))
+    assert scale.scale.reference == word
 
 
 def test_settings_under_their_former_names_are_read(tmp_path: Path) -> None:
@@ -137,6 +180,13 @@ def test_a_failed_write_leaves_the_old_file_and_no_temporary(tmp_path: Path) -> 
         fail_half_way()
     assert path.read_text() == "old"
     assert [each.name for each in tmp_path.iterdir()] == ["result.txt"]
+
+
+@pytest.mark.parametrize("name", ["厨" * 80 + ".txt", "\udcff" * 100 + ".txt", "a" * 251 + ".txt"])
+def test_a_name_as_long_as_the_system_takes_is_written(tmp_path: Path, name: str) -> None:
+    write_text(tmp_path / name, "here")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert files._TEMPORARY.fullmatch(files.temporary_name(name, ".txt"))  # is cleared where its process was killed
 
 
 def test_json_never_holds_nan(tmp_path: Path) -> None:

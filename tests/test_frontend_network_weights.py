@@ -230,6 +230,9 @@ def test_import_refuses_what_it_does_not_know(tmp_path, capsys):
     bent = {**public.tensors, "convDa.weight": torch.zeros(HEAD + 1, WIDTHS[-1], 3, 3)}
     torch.save(missing, tmp_path / "missing.pth")
     torch.save(bent, tmp_path / "bent.pth")
+    plain = PublicNetwork("none").tensors
+    normed = {**plain, **{f"bn3a.{part}": torch.ones(WIDTHS[4]) for part in ("weight", "bias", "running_mean")}}
+    torch.save(normed, tmp_path / "normed.pth")
     torch.save({"fc.weight": torch.zeros(3)}, tmp_path / "other.pth")
     torch.save([1, 2], tmp_path / "list.pth")
     (tmp_path / "evil.pth").write_bytes(pickle.dumps(_Evil()))
@@ -237,6 +240,7 @@ def test_import_refuses_what_it_does_not_know(tmp_path, capsys):
     for name, message in {
         "missing.pth": "bnDb.running_var is missing",
         "bent.pth": "has shape",
+        "normed.pth": "it has `bn3a.running_mean`; fold its batch norm into the convolutions",
         "other.pth": "not a SuperPoint layout",
         "list.pth": "not a state_dict",
         "evil.pth": "not readable as a file of tensors",

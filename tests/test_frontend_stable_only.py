@@ -39,6 +39,9 @@ def test_only_stable_keypoints_are_left_in_their_order() -> None:
 def test_a_frontend_without_the_head_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ConfigError, match="no stability head"):
         StableOnly(Scripted(None), 0.5)(np.zeros((8, 8), np.uint8))
+    for name in ("sift", "superpoint-small"):
+        with pytest.raises(ConfigError, match=f"frontend {name}: has no stability head"):
+            load_frontend(name, least_stability=0.5)
     command = ["run", str(bundled_sequence()), "-o", str(tmp_path / "out"), "--frontend", "orb"]
     assert main([*command, "--set", "frontend.least_stability=0.5"]) == 2
     assert "least_stability must be 0" in capsys.readouterr().err.splitlines()[-1]

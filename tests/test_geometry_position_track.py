@@ -25,7 +25,8 @@ def test_times_are_dates_or_numbers() -> None:
     assert time_in_seconds("2026-05-01T10:00:00.5Z") == 1777629600.5
     assert time_in_seconds("2026-05-01T12:00:00.250+02:00") == 1777629600.25
     assert time_in_seconds("2026-05-01 10:00:00") == 1777629600.0
-    assert time_in_seconds("12.5") == 12.5
+    assert time_in_seconds("2026-05-01T10:00:00,5Z") == 1777629600.5
+    assert time_in_seconds("12.5") == time_in_seconds("12,5") == 12.5
     assert np.isnan(time_in_seconds("noon"))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 
 import pytest
@@ -74,6 +75,20 @@ def test_each_process_has_one_thread_and_is_kept_for_the_next_round(monkeypatch:
 def test_an_error_of_a_task_arrives(task: int, kind: type[Exception], words: str) -> None:
     with Workers(2) as workers, pytest.raises(kind, match=words):
         list(workers.run(fail, [0, task], "tasks"))
+
+
+def die_afterwards(number: int) -> int:
+    if number == 0:
+        threading.Timer(0.2, os._exit, (9,)).start()
+    return number
+
+
+def test_a_process_that_dies_between_two_rounds_is_one_line() -> None:
+    with Workers(2) as workers:
+        assert list(workers.run(die_afterwards, [0, 1, 2], "first")) == [0, 1, 2]
+        time.sleep(0.8)
+        with pytest.raises(WorkerDiedError, match="second: a worker process died"):
+            list(workers.run(die_afterwards, [3, 4], "second"))
 
 
 def test_an_error_ends_the_other_tasks_at_once() -> None:

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -100,6 +101,24 @@ def test_an_error_that_pickle_loses_is_told_in_words():
     results, _ = run(lack, [1], 1)
     assert type(results[1]) is ImprovoError
     assert "pip install 'improvo[plots]'" in str(results[1])
+
+
+def die_afterwards(number: int, tick: Tick) -> int:
+    if number == 0:
+        threading.Timer(0.2, os._exit, (9,)).start()
+    return number
+
+
+def test_a_process_that_dies_while_it_has_nothing_to_do_is_replaced() -> None:
+    """As the system ends the largest one where memory is short."""
+    results: list[object] = []
+
+    def slowly(number: int, result: object) -> None:
+        results.append(result)
+        time.sleep(0.8)
+
+    run_in_processes(die_afterwards, [0, 1, 2], slowly, lambda count: None, 1)
+    assert results == [0, 1, 2]
 
 
 def last_for_minutes(folder: str, tick: Tick = lambda: None) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,7 @@ from improvo.frontend.settings import FrontendSettings
 from improvo.labeling import label_sequences as label_module
 from improvo.labeling.label_sequences import LabelJob, label_sequence
 from improvo.labeling.labeled import read_labels
-from improvo.locations import claim, fetched, is_remote, local_folder, publish, with_urls
+from improvo.locations import claim, fetched, is_remote, local_folder, place, publish, with_urls
 from improvo.odometry.run_settings import LabelRunSettings
 from improvo.stability.settings import LabelQualitySettings, LabelSettings
 from labeled_scene import write_labeled_scene
@@ -59,6 +61,39 @@ def test_what_is_complete_is_sent_and_comes_back_elsewhere(memory: str, cache: P
     assert fsspec.filesystem("memory").cat_file("/bucket/work/deep/a.txt") == b"two, longer"
     fsspec.filesystem("memory").pipe_file("/bucket/work/deep/a.txt", b"three, there")  # changed there
     assert (local_folder(memory) / "deep" / "a.txt").read_text() == "three, there"
+
+
+def check_same_size(url: str, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Networks of one architecture all have one size: the one of now is that which was written last, by whomever."""
+    for machine, seen, step in (("one", "", "200"), ("other", "200", "500"), ("one", "500", "900"), ("one", "900", "")):
+        locations._places.clear()
+        monkeypatch.setenv("IMPROVO_CACHE", str(cache / machine))
+        weights = local_folder(url) / "weights.safetensors"
+        assert (weights.read_text() if weights.exists() else "") == seen
+        if step:
+            write_text(weights, step)
+
+
+def test_a_file_of_the_same_size_is_fetched_anew(memory: str, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    check_same_size(memory, cache, monkeypatch)
+
+
+def test_a_file_of_the_same_size_is_fetched_anew_from_s3(s3: str, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    check_same_size(f"{s3}/network", cache, monkeypatch)
+
+
+def test_what_is_known_of_a_location_by_an_earlier_version_stays_valid(memory: str, cache: Path) -> None:
+    write_text(local_folder(memory) / "a.txt", "one")
+    (state,) = cache.rglob(place.STATE)
+    known = json.loads(state.read_text())
+    known["sent"] = {name: entry[:2] for name, entry in known["sent"].items()}
+    state.write_text(json.dumps(known))
+    locations._places.clear()
+    before = (local_folder(memory) / "a.txt").stat()
+    assert (local_folder(memory) / "a.txt").stat() == before
+    state.write_text("{}")  # damaged
+    locations._places.clear()
+    assert (local_folder(memory) / "a.txt").read_text() == "one"
 
 
 def check_labels(url: str, tmp_path: Path, cache: Path) -> None:
@@ -262,6 +297,42 @@ def check_lock(url: str, tmp_path: Path) -> None:
         assert found["process"] == os.getpid()
         died.release()  # is not its own any more
     assert names(url) == set()
+
+
+def test_who_was_taken_for_dead_does_not_take_it_back(memory: str, tmp_path: Path, quick_claims: None) -> None:
+    """A laptop that slept wakes up, and somebody else is at work."""
+    there = other_machine(memory, tmp_path)
+    path = there.folder / ".improvo.lock"
+    slept = claim.Claim(there, path, {"token": "a"}, lambda holder: False)
+    works = claim.Claim(there, path, {"token": "b"}, lambda holder: True)
+    seen = set()
+    for _ in range(40):
+        time.sleep(0.02)
+        seen.add((claim.read_claim(there, path) or {}).get("token"))
+    assert seen == {"b"}
+    slept.release()
+    assert names(memory) == {".improvo.lock"}
+    works.release()
+    assert names(memory) == set()
+
+
+def test_a_beat_on_its_way_does_not_outlast_the_claim(
+    memory: str, tmp_path: Path, quick_claims: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = other_machine(memory, tmp_path)
+    held = claim.Claim(there, there.folder / ".improvo.lock", {"token": "a"}, lambda holder: False)
+    begun, write = threading.Event(), held._write
+
+    def slowly() -> None:
+        begun.set()
+        time.sleep(0.3)
+        write()
+
+    monkeypatch.setattr(held, "_write", slowly)
+    assert begun.wait(10)
+    held.release()
+    time.sleep(0.4)
+    assert names(memory) == set()
 
 
 def test_a_lock_at_a_location_in_memory(memory: str, tmp_path: Path, quick_claims: None) -> None:

@@ -10,8 +10,11 @@ import pytest
 
 from improvo.cli.main import main
 from improvo.errors import InputError
+from improvo.frontend.decoding import decode
 from improvo.frontend.masking import features_of
 from improvo.frontend.registry import load_frontend
+from improvo.frontend.runtime import NetworkMaps
+from improvo.frontend.settings import NetworkSettings
 from improvo.geometry.camera import Camera
 from improvo.geometry.camera_files import calibration_yaml
 from improvo.sequences import open_sequence
@@ -58,6 +61,8 @@ def test_no_keypoint_is_masked_and_the_budget_goes_to_the_rest(name: str) -> Non
     assert len(features_of(frontend, Frame(0, 0.0, picture, "", np.zeros_like(mask)))) == 0
     with pytest.raises(InputError, match="mask of shape"):
         frontend(picture, mask[:10])
+    with pytest.raises(InputError, match=r"mask of type uint8: give truth values, such as `mask > 0`"):
+        frontend(picture, 255 * mask.astype(np.uint8))
 
 
 def test_a_network_drops_what_moves_onto_the_mask_and_masks_rows_of_a_batch() -> None:
@@ -71,6 +76,23 @@ def test_a_network_drops_what_moves_onto_the_mask_and_masks_rows_of_a_batch() ->
     x, y = np.rint(masked.keypoints).astype(int).T
     assert mask[y, x].all()
     np.testing.assert_array_equal(plain.keypoints, frontend(picture).keypoints)
+
+
+@pytest.mark.parametrize("corner_radius", [0, 5])
+def test_a_centre_of_mass_is_not_on_the_mask_either(corner_radius: int) -> None:
+    """Two peaks with a masked column between them: the centre of both lies on it."""
+    heat = np.zeros((1, 64, 64), np.float32)
+    heat[0, 32, [10, 14, 40]] = 0.5, 0.49, 0.3
+    mask = np.ones((64, 64), np.bool_)
+    mask[:, 12] = False
+    picture = np.zeros((64, 64), np.float32)
+    picture[32:, 10:12] = picture[32:, 13:15] = picture[32:, 40:] = 1.0
+    maps = NetworkMaps(heat, np.ones((1, 8, 8, 4), np.float32), None)
+    found = decode(maps, 0, picture, NetworkSettings(nms_radius=2, corner_radius=corner_radius), mask)
+    x, y = np.rint(found.keypoints).astype(int).T
+    assert len(found) > 0
+    assert mask[y, x].all()
+    assert len({*zip(x.tolist(), y.tolist(), strict=True)}) == len(found)
 
 
 def test_a_sequence_carries_its_mask_with_a_border(tmp_path: Path) -> None:

@@ -229,3 +229,21 @@ def test_a_file_for_rerun_that_does_not_fit_costs_no_results(
     assert capsys.readouterr().err == f"improvo: {path}: cannot be written (is the disk full?); choose another\n"
     assert RunFolder(tmp_path / "out").frames == FRAMES
     assert [entry.name for entry in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_run_with_relative_paths_is_found_from_any_folder(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Recording, camera and mask as they are typed in the folder where they lie; the pictures are made elsewhere."""
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    shutil.copytree(walk, "walk")
+    Path("walk/camera.yaml").rename("own.yaml")
+    cv2.imwrite("mask.png", np.full((240, 320), 255, np.uint8))
+    few = ["--max-frames", "12", "--frontend", "orb", "--max-keypoints", "200", "--quiet"]
+    assert main(["run", "walk", "-o", "out", "--camera", "own.yaml", "--mask", "mask.png", *few]) in (0, 3)
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    run = RunFolder(tmp_path / "here" / "out")
+    assert run.image(3).shape == (240, 320)
+    assert run.sequence.camera.fx == 260.0

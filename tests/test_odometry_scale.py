@@ -358,7 +358,7 @@ def test_the_ground_is_the_lowest_plane_and_not_the_table() -> None:
 
 
 def test_settings_are_checked() -> None:
-    assert scale_settings([["truth", "a b.txt"]]) == ["scale.source=truth", "scale.reference='a b.txt'"]
+    assert scale_settings([["truth", "a b.txt"]]) == ["scale.source=truth", "scale.reference=a b.txt"]
     distances = scale_settings([["distance", "1", "9", "2"], ["distance", "20", "30", "1.5"]])
     assert distances == ["scale.source=distance", "scale.distances=[[1, 9, 2.0], [20, 30, 1.5]]"]
     with pytest.raises(ConfigError, match="given twice"):

@@ -103,3 +103,16 @@ def test_actions_are_pinned_by_their_commit(path: Path) -> None:
 )
 def test_licences_that_may_be_depended_on(licence: str, verdict: bool) -> None:
     assert recipe("licences").may_depend_on(licence) == verdict
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="needs tomllib, of Python 3.11")
+def test_dependencies_that_have_wheels_but_not_together_are_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wheels = recipe("wheels")
+    monkeypatch.setattr(wheels, "resolved", lambda requirements, platform, python: "no: a" if requirements[1:] else "")
+    monkeypatch.setattr("sys.argv", ["wheels", "--each", "--python", "3.12"])
+    with pytest.raises(SystemExit) as end:
+        wheels.main()
+    assert end.value.code == 1
+    assert "no: a (together)" in capsys.readouterr().out

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import cv2
@@ -18,11 +19,14 @@ import pytest
 from improvo.cli.main import main
 from improvo.export.model import segment_model
 from improvo.export.trajectory import export_trajectory
+from improvo.geometry.camera import Camera
 from improvo.odometry.map_file import read_map, write_map
 from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.view import View
+from improvo.report import rerun_viewer
 from improvo.sequences import open_sequence, read_trajectory
 from improvo.stability.tables import read_tracks
-from improvo.types import SparseMap, Trajectory
+from improvo.types import Frame, SparseMap, Trajectory
 
 
 def test_map_is_read_back_as_it_was_written(finished_run: Path) -> None:
@@ -241,6 +245,23 @@ def in_two_segments(finished: Path, folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--min-observations", "0"], "--min-observations 0: must be at least 1"),
+        (["--max-error", "nan"], "--max-error nan: must be positive"),
+        (["--max-error", "-1"], "--max-error -1: must be positive"),
+    ],
+)
+def test_an_export_of_nothing_is_refused(
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    for target in ("colmap", "nerfstudio"):
+        assert main(["export", target, str(finished_run), "-o", str(tmp_path / "new"), *words]) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
 def test_segments_are_models_of_their_own_the_longest_first(
     finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -257,6 +278,66 @@ def test_segments_are_models_of_their_own_the_longest_first(
     assert main(["show", "map", str(run)]) == 0
     assert main(["report", str(run)]) == 0
     assert "2 segments (new ones start at frames 18)" in (run / "report.html").read_text()
+
+
+def test_no_line_leads_from_one_segment_to_the_next(
+    finished_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("rerun", reason="needs Rerun: pip install 'improvo[view]'")
+    run, drawn = RunFolder(in_two_segments(finished_run, tmp_path / "run")), []
+    monkeypatch.setattr(rerun_viewer._Recording, "links", lambda self, centres, *others: drawn.append(centres))
+    rerun_viewer.show_run(run, tmp_path / "run.rrd", images=False)
+    assert [len(centres) for centres in drawn] == [18, 12]
+    assert (np.concatenate(drawn) == run.trajectory.camera_centers).all()
+
+
+@pytest.mark.parametrize("kept", [[5, 9, 20], [0, 29], [12], []])
+def test_frames_without_a_pose_have_their_own_times(finished_run: Path, tmp_path: Path, kept: list[int]) -> None:
+    """Seconds of the recording, also where it is not there any more, and never numbers of frames among them."""
+    folder = Path(shutil.copytree(finished_run, tmp_path / "run"))
+    lines = (folder / "trajectory.txt").read_text().splitlines(keepends=True)
+    poses = [line for line in lines if not line.startswith("#")]
+    (folder / "trajectory.txt").write_text("".join(poses[number] for number in kept))
+    report = json.loads((folder / "run.json").read_text())
+    report["frames"].update(tracked=len(kept), lost_frames=[number for number in range(30) if number not in kept])
+    (folder / "run.json").write_text(json.dumps(report))
+    run = RunFolder(folder)
+    times = rerun_viewer._times(run)
+    if len(kept) > 1:
+        np.testing.assert_allclose(times, run.sequence.times, atol=1e-6)
+    assert (np.diff(times) >= 0).all()
+
+
+def test_a_live_recording_grows_with_its_frames_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("rerun", reason="needs Rerun: pip install 'improvo[view]'")
+    sent: Counter[str] = Counter()
+
+    def links(self: object, centres: np.ndarray, colours: np.ndarray, path: str, static: bool = False) -> None:
+        assert len(colours) == max(len(centres) - 1, 0)
+        sent["links"] += len(colours)
+        ends[path] = centres[-1, 0]
+
+    def points(self: object, xyz: np.ndarray, colours: np.ndarray, path: str = "world/points") -> None:
+        sent[path] += len(xyz)
+        sent["last"] = len(xyz)
+
+    ends: dict[str, float] = {}
+    monkeypatch.setattr(rerun_viewer._Recording, "links", links)
+    monkeypatch.setattr(rerun_viewer._Recording, "points", points)
+    viewer = rerun_viewer.RerunViewer(tmp_path / "live.rrd")
+    viewer.begin(Camera(32, 24, 30.0, 30.0, 15.5, 11.5))
+    none = np.zeros(0, np.int64)
+    for number in range(1000):
+        pose = np.eye(4)
+        pose[0, 3] = -number
+        nothing = np.zeros((0, 2)), np.zeros((0, 8), np.float32), np.zeros(0), none, none
+        view = View(number, number / 30, *nothing, cam_from_world=pose)
+        viewer.show(Frame(number, number / 30, np.zeros((24, 32), np.uint8), ""), view, np.zeros((5 * number, 3)))
+    viewer.end()
+    assert sent["links"] <= 1000 * 100
+    assert sent["world/points"] <= 12 * 5 * 1000
+    assert sent["last"] == 5 * 999, "the whole map at the end"
+    assert [ends[f"world/trajectory/{piece}"] for piece in range(10)] == [*range(100, 1000, 100), 999.0]
 
 
 def test_an_export_does_not_touch_a_folder_of_others(

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -21,6 +22,8 @@ from improvo.report.charts import line_chart
 from improvo.report.improvement_page import Measure, Round, write_improvement_page
 from improvo.report.page import Page
 from improvo.report.plain_words import ranges, warnings
+from improvo.report.true_path import true_path
+from improvo.types import Trajectory
 
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 FLAGS = (
@@ -172,6 +175,25 @@ def test_report_without_its_recording_says_so(finished_run: Path, tmp_path: Path
     assert 'id="scene"' in text
 
 
+def test_folders_with_spaces_are_left_out_too(finished_run: Path, tmp_path: Path) -> None:
+    home = tmp_path / "jane doe" / "my videos"
+    home.mkdir(parents=True)
+    walk, run = home / "walk", home / "run"
+    shutil.copytree(finished_run.parent / "walk", walk)
+    shutil.copytree(finished_run, run)
+    content = json.loads((run / "run.json").read_text())
+    content["input"].update(path=str(walk), notes=[f"{walk}: is only a test"])
+    content["input"]["skipped"] = [{"source": str(walk / "000007.png"), "reason": "is damaged \ud83d"}]
+    content["configuration"]["sequence"].update(mask="C:\\Users\\jane\\mask.png", camera=str(walk / "camera.yaml"))
+    (run / "run.json").write_text(json.dumps(content))
+    assert main(["report", str(run)]) == 0
+    text = (run / "report.html").read_text()
+    assert "jane" not in text
+    assert "my videos" not in text
+    for word in ("walk: is only a test", "first is walk/000007.png", "mask.png", "camera.yaml", "is damaged \ufffd"):
+        assert word in text
+
+
 def test_text_of_others_is_escaped(tmp_path: Path) -> None:
     page = Page("<script>alert(1)</script>", "a & b")
     page.table(["<b>", "x"], [["**1**", "</td>"]])
@@ -243,6 +265,81 @@ def test_chart_leaves_gaps_where_there_is_nothing() -> None:
     assert line_chart(x, np.full(10, np.nan), "nothing").count("<polyline") == 0
 
 
+def test_names_with_bars_stay_in_their_cell(tmp_path: Path) -> None:
+    from improvo.evaluation.tables import markdown
+
+    text = markdown(["what", "a"], [["attic | morning", "1"], ["two\nlines", "2|"]])
+    assert len(text.splitlines()) == 4
+    page = Page("tables", "of names")
+    page.markdown(text)
+    page.markdown("| plain | b |\n|---|--:|\n| c | d |\n")
+    page.write(tmp_path / "page.html")
+    rows = re.findall("<tr>(.*?)</tr>", (tmp_path / "page.html").read_text())
+    assert [re.findall("<t[hd]>(.*?)</t[hd]>", row) for row in rows] == [
+        *(["what", "a"], ["attic | morning", "1"], ["two\\nlines", "2|"]),
+        *(["plain", "b"], ["c", "d"]),
+    ]
+
+
+def test_a_true_path_with_gaps_is_as_long_as_it_is() -> None:
+    """Where every second frame has no truth, the error is a share of the whole path all the same."""
+    angle = np.linspace(0, 3, 60)
+    true = np.stack([np.cos(angle), np.sin(angle), 0.1 * angle], axis=1)
+    estimate = 0.5 * true + np.random.default_rng(0).normal(0, 0.004, true.shape)
+    found = []
+    for without in (slice(0, 0), slice(1, None, 2), slice(20, 40)):
+        poses = np.tile(np.eye(4), (60, 1, 1))
+        poses[:, :3, 3] = true
+        poses[without] = np.nan
+        estimated = np.tile(np.eye(4), (60, 1, 1))
+        estimated[:, :3, 3] = estimate
+        sequence = SimpleNamespace(ground_truth=Trajectory(np.arange(60.0), poses), indices=np.arange(60))
+        run = SimpleNamespace(
+            trajectory=Trajectory(np.arange(60.0), estimated),
+            sequence=sequence,
+            source_index=list(range(60)),
+            frame_indices=np.arange(60),
+        )
+        path = true_path(run)  # type: ignore[arg-type]
+        assert path is not None
+        assert (np.isfinite(path.errors) == np.isfinite(poses[:, 0, 0])).all()
+        found.append(path.ate_percent)
+        drawn = np.isfinite(path.drawn()[:, 0])
+        assert drawn[:59].all() if without.step == 2 else (drawn == np.isfinite(path.errors)).all()
+    np.testing.assert_allclose(found, 100 * 0.004 * np.sqrt(3) / 1.505, rtol=0.2)
+
+
+def test_chart_shows_a_value_that_stands_alone() -> None:
+    """One frame, or one with a pose between frames that have none."""
+    assert line_chart(np.zeros(1), np.ones(1), "one").count("<circle") == 1
+    svg = line_chart(np.arange(5.0), np.array([1.0, 2.0, np.nan, 4.0, np.nan]), "some")
+    assert (svg.count("<polyline"), svg.count("<circle")) == (1, 1)
+    assert '<circle cx="687.0" cy="28.0"' in svg
+
+
+@pytest.mark.parametrize("last", [6, 8, 11, 29, 1000])
+def test_chart_writes_numbers_where_they_stand(last: int) -> None:
+    x = np.arange(last + 1.0)
+    svg = line_chart(x, x, "the diagonal")
+    (points,) = re.findall(r'points="([^"]*)"', svg)
+    column_of = {number: point.split(",")[0] for number, point in enumerate(points.split())}
+    written = re.findall(r'<text x="([0-9.]+)" y="176" text-anchor="[a-z]+">([0-9]+)</text>', svg)
+    assert len(written) == 6
+    assert all(column_of[int(number)] == column for column, number in written)
+
+
+@pytest.mark.parametrize("y", [[0.0, 0.0], [-1.0, -2.0], [1e-320, 0.0], [np.inf, 1.0], [1e-10, 2e-10]])
+def test_chart_of_any_values_has_a_few_lines(y: list[float]) -> None:
+    assert 3 <= line_chart(np.arange(2.0), np.array(y), "values").count("<line") <= 6
+
+
+def test_a_damaged_table_of_an_evaluation_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "vo.json").write_text('{"rows": [1]}')
+    (tmp_path / "vo.md").write_bytes(b"# Table\xff\xfe")
+    assert main(["report", str(tmp_path)]) == 2
+    assert "vo.md: is damaged (" in capsys.readouterr().err
+
+
 def test_an_evaluation_page_has_its_tables_and_meaning(tmp_path: Path) -> None:
     (tmp_path / "vo.json").write_text('{"rows": [1]}')
     (tmp_path / "vo.md").write_text("# Table\n\n- one < two\n\n| a | b |\n|---|--:|\n| sift | **.5** |\n")
@@ -290,6 +387,54 @@ def test_a_label_store_has_a_page_with_what_failed_and_why(finished_run: Path, t
     assert text.count("data:image/png") == 2  # the map from above, and the same for a telephone
     assert "Withheld: it had a label" in text
     assert main(["report", str(labels / "walk"), "-o", str(tmp_path / "one.html")]) == 0
+    assert main(["report", str(labels), "--palette", "colour-blind"]) == 0
+    pictures = re.compile(r"data:image/png[^\"]*")
+    assert set(pictures.findall((labels / "report.html").read_text())).isdisjoint(pictures.findall(text))
+
+
+def test_the_place_of_a_recording_is_refused_where_there_is_no_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "vo.json").write_text('{"rows": [1]}')
+    (tmp_path / "vo.md").write_text("# Table\n")
+    assert main(["report", str(tmp_path), "--sequence", "walk"]) == 2
+    assert "--sequence walk: belongs to the folder of a run" in capsys.readouterr().err
+
+
+def with_poses(finished: Path, folder: Path, kept: list[int]) -> Path:
+    """A copy of a run in which only these frames have a pose."""
+    shutil.copytree(finished, folder)
+    lines = (folder / "trajectory.txt").read_text().splitlines(keepends=True)
+    comments, poses = ([line for line in lines if line.startswith("#") == is_one] for is_one in (True, False))
+    (folder / "trajectory.txt").write_text("".join([*comments, *(poses[number] for number in kept)]))
+    content = json.loads((folder / "run.json").read_text())
+    lost = [number for number in range(content["frames"]["processed"]) if number not in kept]
+    content["frames"].update(tracked=len(kept), lost=len(lost), lost_frames=lost)
+    (folder / "run.json").write_text(json.dumps(content))
+    return folder
+
+
+@pytest.mark.parametrize("kept", [[5], [5, 6], [5, 9]])
+def test_a_run_with_one_or_two_poses_has_a_map_and_a_page(finished_run: Path, tmp_path: Path, kept: list[int]) -> None:
+    run = with_poses(finished_run, tmp_path / "run", kept)
+    assert main(["show", "map", str(run)]) == 0
+    assert main(["report", str(run)]) == 0
+    assert f"{len(kept)} of 30" in (run / "report.html").read_text()
+
+
+def test_a_run_without_frames_is_one_line(
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As one that was interrupted before its first."""
+    run = with_poses(finished_run, tmp_path / "run", [])
+    content = json.loads((run / "run.json").read_text())
+    content["frames"].update(processed=0, tracked=0, lost=0, lost_frames=[], source_index=[])
+    content["segments"] = []
+    (run / "run.json").write_text(json.dumps(content))
+    for words in (["tracks", "--frames", "all"], ["labels"], ["residuals", "--video"]):
+        assert main(["show", words[0], str(run), *words[1:]]) == 2
+        assert capsys.readouterr().err == f"improvo: {run}: has no frames to draw\n"
+    assert main(["report", str(run)]) == 0
 
 
 def test_a_wide_table_and_the_map_fit_on_paper(page: Path, tmp_path: Path, browser: Any) -> None:

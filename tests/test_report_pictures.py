@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,8 +16,10 @@ from PIL import Image
 from improvo.cli.main import main
 from improvo.geometry.se3 import rigid, so3_exp
 from improvo.odometry.run_folder import RunFolder
-from improvo.report.canvas import Canvas
+from improvo.report.canvas import Canvas, captioned
+from improvo.report.map_picture import map_png
 from improvo.report.overhead import overhead_axes, robust_limits
+from improvo.report.page_data import pixel_parts
 from improvo.report.palettes import PALETTES
 from improvo.report.sheets import write_video
 from improvo.report.stability_picture import suppressed_regions
@@ -72,6 +76,29 @@ def test_map_has_white_points_a_jet_trajectory_and_a_black_last_window(finished_
     assert ((green > 180) & (blue > 60) & (red < 200) & (abs(red - green) > 40)).sum() > 20, "no middle of the ramp"
     assert (drawn.max(axis=-1) < 40).sum() > 100, "no black last window"
     assert ((drawn.min(axis=-1) > 200)[100:-100]).sum() > 500, "no white points"
+
+
+def test_the_axes_of_a_map_begin_at_the_first_camera(finished_run: Path) -> None:
+    """Wherever its world does: after a start that needed some frames, or with the poses of another system."""
+    usual, moved = RunFolder(finished_run), RunFolder(finished_run)
+    offset = np.array([100.0, -20.0, 7.0])
+    poses = usual.trajectory.world_from_cam.copy()
+    poses[:, :3, 3] += offset
+    vars(moved)["trajectory"] = replace(usual.trajectory, world_from_cam=poses)
+    vars(moved)["map"] = replace(usual.map, xyz=usual.map.xyz + offset)
+    pictures = [
+        cv2.imdecode(np.frombuffer(map_png(run), np.uint8), cv2.IMREAD_COLOR).astype(int) for run in (usual, moved)
+    ]
+    assert pictures[0].shape == pictures[1].shape
+    assert np.abs(pictures[0] - pictures[1]).mean() < 0.5
+
+
+@pytest.mark.parametrize("size", [(320, 240), (5312, 2988), (3000, 8192), (16384, 16384)])
+def test_points_of_wide_pictures_fit_into_two_bytes(size: tuple[int, int]) -> None:
+    parts = pixel_parts(*size)
+    assert 1 <= parts <= 16
+    assert parts * (max(size) - 0.5) <= 65535.5
+    assert parts == 16 or (parts + 1) * max(size) > 65536
 
 
 @pytest.mark.parametrize("scale_to", [64, 256])
@@ -138,6 +165,28 @@ def test_video_keeps_its_colours(tmp_path: Path) -> None:
     np.testing.assert_allclose(frame.reshape(-1, 3).mean(axis=0), [0, 0, 220], atol=25)
 
 
+@pytest.mark.parametrize("fps", [0.5, 15.0, 24.0, 30.0, 60.0, 119.88])
+@pytest.mark.parametrize("suffix", [".gif", ".webp", ".mp4", ".webm"])
+def test_a_moving_picture_lasts_as_long_as_it_should(tmp_path: Path, suffix: str, fps: float, capfd: Any) -> None:
+    """A GIF counts in hundredths of a second, and browsers refuse to show one faster than every second of them."""
+    path = tmp_path / f"moving{suffix}"
+    write_video(path, (np.full((20, 32, 3), 40 * (number % 6), np.uint8) for number in range(24)), fps)
+    assert capfd.readouterr().err == ""
+    if suffix in (".mp4", ".webm"):
+        video = cv2.VideoCapture(str(path))
+        assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(fps, rel=0.001)
+        assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 24
+        return
+    with Image.open(path) as image:
+        durations = []
+        for number in range(image.n_frames):
+            image.seek(number)
+            image.load()
+            durations.append(image.info["duration"])
+    assert sum(durations) == pytest.approx(24000 / fps, abs=20)
+    assert min(durations) >= (20 if suffix == ".gif" else 0)
+
+
 def test_a_recording_that_moved_is_named_with_its_mend(
     finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -150,6 +199,8 @@ def test_a_recording_that_moved_is_named_with_its_mend(
     moved = ["--sequence", str(finished_run.parent / "walk"), "--frames", "1"]
     assert main(["show", "tracks", str(run), *moved]) == 0
     assert (run / "pictures" / "tracks.png").is_file()
+    matches = ["matches", str(run), "--frontends", "orb", "--pair", "0,5", *moved[:2], "-o", str(tmp_path / "m.png")]
+    assert main(["show", *matches]) == 0
 
 
 @pytest.mark.parametrize(
@@ -160,6 +211,12 @@ def test_a_recording_that_moved_is_named_with_its_mend(
         (["labels", "RUN", "--frames", "many"], "--frames many"),
         (["labels", "RUN", "--each", "-o", "new.png"], "name a folder, or a video"),
         (["labels", "RUN", "-o", "new.mp4", "--video-width", "3"], "at least 16 pixels"),
+        (["labels", "RUN", "--video-fps", "0"], "--video-fps 0: must be positive"),
+        (["labels", "RUN", "--video-fps", "nan"], "--video-fps nan: must be positive"),
+        (["map", "RUN", "--last", "0"], "--last 0: must be at least 1"),
+        (["stability", "RUN", "--width", "32"], "--width: "),
+        (["matches", "RUN", "--fov", "70"], "is a run, whose recording is read as it was then"),
+        (["matches", "demo", "--sequence", "x"], "belongs to the folder of a run"),
         (["map", "RUN", "-o", "no/such/place.png"], "no folder"),
         (["accuracy", "RUN"], "pose.json"),
         (["stability", "RUN"], "no stability head"),
@@ -185,11 +242,48 @@ def test_a_pair_is_named_by_frames_or_by_the_time_between_them() -> None:
     assert _pair("3,40", sequence) == [3, 40]
     assert _pair("3,+5", sequence) == [3, 8]
     assert _pair("10,+1.5s", sequence) == [10, 55]
-    for wrong in ("3", "3,", "a,4", "3,+s", "3,4,5", "3,+x"):
+    for wrong in ("3", "3,", "a,4", "3,+s", "3,4,5", "3,+x", "3,+nans", "3,+infs", "3,+-1s", "3,+-5", "3,+0", "3,+0s"):
         with pytest.raises((InputError, ConfigError), match=re.escape(f"{wrong.split(',')[0]}")):
             _pair(wrong, sequence)
     with pytest.raises(ConfigError, match="no frame 163"):
         _pair("13,+5s", sequence)
+
+
+def test_a_second_later_is_one_whatever_the_rate_is_there(tmp_path: Path) -> None:
+    """Of a recording of 10 frames a second that lost two seconds after its frame 4."""
+    from improvo.cli.show_recording import _pair
+    from improvo.sequences import open_sequence
+
+    folder = tmp_path / "rgb"
+    folder.mkdir()
+    times = np.concatenate([np.arange(5), np.arange(25, 45)]) / 10
+    for number in range(len(times)):
+        cv2.imwrite(str(folder / f"{number}.png"), np.full((24, 32), number, np.uint8))
+    lines = [f"{time:.3f} rgb/{number}.png\n" for number, time in enumerate(times)]
+    (tmp_path / "rgb.txt").write_text("".join(lines))
+    sequence = open_sequence(tmp_path, camera="30,30,16,12")
+    assert _pair("2,+1s", sequence) == [2, 4]  # 0.4 s is nearer to 1.2 than 2.5
+    assert _pair("3,+1.5s", sequence) == [3, 5]
+    assert _pair("5,+1s", sequence) == [5, 15]
+    assert _pair("0,+0.01s", sequence) == [0, 1]
+
+
+@pytest.mark.parametrize("width", [40, 160, 320, 640, 1280, 1920])
+@pytest.mark.parametrize(
+    "words", ["short", "frame 10, superpoint-vo: 357 stable keypoints (white), circled: 1", "w" * 400]
+)
+def test_a_caption_leaves_the_legend_alone(width: int, words: str) -> None:
+    legend = (PALETTES["paper"].ramp_strip(), "stable", "unstable")
+    picture = np.zeros((20, width, 3), np.uint8)
+    bare, with_words = captioned(picture, "", legend), captioned(picture, words, legend)
+    assert bare.shape == with_words.shape
+    written = np.flatnonzero((bare != with_words).any(axis=(0, 2)))
+    of_legend = np.flatnonzero((bare[20:] != 24).any(axis=(0, 2)))
+    assert len(written) > 0 or width == 40
+    assert (len(of_legend) > 0) == (width >= 320)
+    if len(of_legend) and len(written):
+        assert written.max() + 4 < of_legend.min()
+    assert (with_words[:, -4:] == bare[:, -4:]).all()
 
 
 def test_suppressed_regions_are_where_most_suppressed_points_are() -> None:

@@ -110,6 +110,10 @@ def test_names_that_are_counts_or_dates_of_the_calendar_are_no_stamps(tmp_path: 
         ([1.7e9, 1.7e9 + 1], "seconds"),
         ([1.7e18, 1.7e18 + 5e7], "nanoseconds"),
         ([np.nan], "seconds"),
+        (np.arange(180) * 33_333_333.0, "nanoseconds"),  # their middle would be 2065 in seconds
+        (1.2e9 + np.arange(300) * 33_333.0, "microseconds"),  # since 20 minutes before: 2008 in seconds
+        (1.2e12 + np.arange(300) * 33_333_333.0, "nanoseconds"),  # likewise: 2008 in milliseconds
+        (1.7e9 + np.arange(10) * 600.0, "seconds"),  # every ten minutes, with dates
     ],
 )
 def test_units_by_size(stamps: list[float], unit: str) -> None:

@@ -84,6 +84,26 @@ def test_bad_rows_are_counted_and_named(tmp_path: Path) -> None:
     assert all(str(file) in problem for problem in problems)
 
 
+def test_a_bad_row_of_kitti_keeps_its_place(tmp_path: Path) -> None:
+    rows = [f"1 0 0 {number} 0 1 0 0 0 0 1 0" for number in range(6)]
+    rows[2], rows[3] = "1 0 0 two 0 1 0 0 0 0 1 0", "1 0 0"
+    (tmp_path / "00.txt").write_text("\n".join(rows) + "\n")
+    read, problems = read_trajectory_report(tmp_path / "00.txt")
+    assert read.times.tolist() == [0.0, 0.1, 0.2, 0.3, 0.4, 0.5]
+    assert read.camera_centers[read.valid, 0].tolist() == [0, 1, 4, 5]
+    assert [problem for problem in problems if "NaN" in problem] == []
+    assert "2 rows without a pose: not numbers (lines 3, 4)" in "\n".join(problems)
+    (tmp_path / "times.txt").write_text("".join(f"{0.5 * number}\n" for number in range(6)))
+    assert read_trajectory(tmp_path / "00.txt").times[-1] == 2.5
+
+
+def test_a_row_without_a_time_is_named(tmp_path: Path) -> None:
+    (tmp_path / "t.txt").write_text("0 0 0 0 0 0 0 1\nnan 1 0 0 0 0 0 1\n2 2 0 0 0 0 0 1\n")
+    read, problems = read_trajectory_report(tmp_path / "t.txt")
+    assert read.times.tolist() == [0, 2]
+    assert "1 rows without a pose: no time (line 2)" in "\n".join(problems)
+
+
 def test_slightly_scaled_rotations_are_projected_and_others_refused() -> None:
     matrices = poses(3)
     matrices[0, :3, :3] *= 1 + 3e-4

@@ -66,6 +66,17 @@ def test_wrong_settings_are_refused() -> None:
         preset("palace")
     with pytest.raises(ConfigError, match="frames"):
         SimulationSettings(frames=1)
+    for change, said in (
+        ({"noise": -2.0}, "`noise`: -2.0 is too small; at least 0"),
+        ({"exposure_time": -0.1}, "`exposure_time`"),
+        ({"balls": -1}, "`balls`"),
+        ({"gloss": 1.5}, "`gloss`: 1.5 is a share between 0 and 1"),
+        ({"plain_share": 0.6, "repeated_share": 0.6}, "not be more than 1 together"),
+        ({"room_height": 0.3}, "`room_height`: 0.3 must lie between"),
+        ({"turn": float("nan")}, "`turn`"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            preset("home", **change)
     with pytest.raises(ConfigError, match="room_size"):
         SimulationSettings(room_size=(1.0, 2.0))
 

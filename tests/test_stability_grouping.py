@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from improvo.errors import InputError
 from improvo.stability.grouping import medians, rows_of
 
 
@@ -32,3 +34,6 @@ def test_rows_of_ids_in_any_order() -> None:
     ids = np.array([40, 10, 30])
     np.testing.assert_array_equal(rows_of(ids, np.array([10, 40, 40, 30])), [1, 0, 0, 2])
     assert len(rows_of(ids, np.zeros(0, np.int64))) == 0
+    for known, wanted in ((ids, [10, 20]), (ids, [50]), (np.zeros(0, np.int64), [0])):
+        with pytest.raises(InputError, match=f"track {wanted[-1]} is in one table and not in the other"):
+            rows_of(known, np.array(wanted))

@@ -19,6 +19,7 @@ pytest.importorskip("torch", reason="training needs the extra `train`")
 import torch
 
 from improvo import config
+from improvo.errors import ConfigError
 from improvo.frontend.network import load_network_frontend
 from improvo.frontend.registry import load_frontend
 from improvo.frontend.runtime_torch import load_network
@@ -55,6 +56,20 @@ def test_a_recipe_imports_and_explains_itself(
         module.main()
     assert end.value.code == 0
     assert f"recipes/{name}.py" in capsys.readouterr().out
+
+
+def test_a_sum_of_weights_is_one_of_all_their_heads_or_says_why_not() -> None:
+    without, having = (load_weights(find_weights(name)) for name in ("superpoint-small", "superpoint-vo-small"))
+    combined = recipe("combine").combined
+    found = combined([("a", having, 0.5), ("b", without, 1.5), ("c", without, -1.0)]).tensors
+    first, other = having.tensors["encoder.0.convolution.weight"], without.tensors["encoder.0.convolution.weight"]
+    np.testing.assert_allclose(found["encoder.0.convolution.weight"], 0.5 * first + 0.5 * other, atol=1e-6)
+    bias = "stability.1.convolution.bias"
+    np.testing.assert_allclose(found[bias], having.tensors[bias], rtol=1e-6)
+    with pytest.raises(ConfigError, match="is not in the first file"):
+        combined([("a", without, 0.5), ("b", having, 0.5)])
+    with pytest.raises(ConfigError, match="sum to zero"):
+        combined([("a", having, 0.5), ("b", having, -0.5), ("c", without, 1.0)])
 
 
 @pytest.mark.parametrize("name", ["stability-head", "superpoint-vo"])

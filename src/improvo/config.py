@@ -71,6 +71,17 @@ def to_yaml(settings: Any) -> str:
     return yaml.safe_dump(to_dict(settings), sort_keys=False)
 
 
+def yaml_line(value: Any) -> str:
+    """A plain value as YAML on one line, however long it is and whatever is in its words."""
+    import yaml
+
+    options: dict[str, Any] = {"default_flow_style": True, "width": math.inf}
+    text = str(yaml.safe_dump(value, **options)).removesuffix("\n...\n").rstrip("\n")
+    if "\n" in text:  # words with a line break, which quotes alone write as `\n`
+        text = str(yaml.safe_dump(value, default_style='"', **options)).rstrip("\n")
+    return text
+
+
 def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = (), base: T | None = None) -> T:
     """Settings of type `cls` from defaults (or `base`, such as a preset), a YAML file and `a.b=value` overrides.
 

@@ -32,7 +32,7 @@ FORMER_NAME = "sivo"  # of this package; folders and weights written under it st
 _TEMPORARY = re.compile(r"\..+\.(\d+)(?:-(\w+))?\.partial(?:\..*)?", re.DOTALL)  # see `temporary_name`
 _HOST = hashlib.sha256(socket.gethostname().encode()).hexdigest()[:6]
 _FOREIGN_SECONDS = 86400.0  # after which a temporary file of another machine is of a process that ended
-_LONGEST_NAME = 100  # characters of a name that go into that of its temporary file
+_LONGEST_NAME = 100  # bytes of a name that go into that of its temporary file; systems take 255 in all
 _open_here: set[str] = set()  # names of temporary files and folders that this process is writing
 _sources: weakref.WeakKeyDictionary[object, Path] = weakref.WeakKeyDictionary()  # reader -> the file that it reads
 
@@ -89,7 +89,8 @@ def temporary_name(name: str, suffix: str = "") -> str:
 
     .NAME.PROCESS-MACHINE+CHANCE.partial.SUFFIX
     """
-    return f".{name[:_LONGEST_NAME]}.{os.getpid()}-{_HOST}{secrets.token_hex(4)}.partial{suffix[:20]}"
+    short = os.fsencode(name)[:_LONGEST_NAME].decode(errors="ignore") or "_"
+    return f".{short}.{os.getpid()}-{_HOST}{secrets.token_hex(4)}.partial{suffix[:20]}"
 
 
 def clear_leftovers(folder: Path) -> None:
@@ -225,7 +226,7 @@ def check_output_file(path: Path, suffixes: Collection[str] = ()) -> None:
 
 def _check_name(path: Path) -> None:
     try:
-        check_path(path)
+        check_path(path, reachable=True)
     except InputError as error:
         raise OutputError(str(error)) from None
     if not is_text(path):  # tables and networks are written by libraries that take nothing else

@@ -102,17 +102,17 @@ def stages(unit: str) -> Iterator[Callable[[str, int, int], None]]:
     Yields:
         What to tell: the stage in words, how many are done, and of how many.
     """
-    before: dict[str, int] = {}  # stage -> how many were done when it was last heard of
+    now, before = "", 0  # the stage, and how many of it were done when it was last heard of
     bar = Progress()
     with ExitStack() as shown:
 
         def told(stage: str, done: int, total: int) -> None:
-            nonlocal bar
-            if stage not in before:
+            nonlocal bar, now, before
+            if stage != now or done < before:  # the next stage, or the same of the next recording
                 shown.close()
-                bar = shown.enter_context(progress(stage, unit, total))
-            bar.advance(done - before.get(stage, 0))
-            before[stage] = done
+                bar, now, before = shown.enter_context(progress(stage, unit, total)), stage, 0
+            bar.advance(done - before)
+            before = done
 
         yield told
 

@@ -285,6 +285,7 @@ def evaluate_pose(
     """
     import tempfile
 
+    from improvo.evaluation.pose.gaps import with_gaps_in_frames
     from improvo.evaluation.pose.results import results
     from improvo.evaluation.pose.run import run_pose_protocol
     from improvo.evaluation.settings import PoseSettings
@@ -294,6 +295,7 @@ def evaluate_pose(
 
     settings = settings or PoseSettings()
     sources = [Recorded(str(path), sequence_settings or SequenceSettings()) for path in sequences]
+    settings = with_gaps_in_frames(settings, [source.open() for source in sources])
     loaded = [LoadedFrontend(name, settings.max_keypoints) for name in frontends]
     for frontend in loaded:
         frontend.check()

@@ -95,7 +95,7 @@ def parse_board(text: str) -> Board:
     """`9x6:25mm`: a checkerboard with 9 by 6 inner corners and squares of 25 mm; `charuco:8x11:20mm`: 8 by 11 squares.
 
     Raises:
-        InputError: anything else, or a board that cannot be told from its own rotations.
+        InputError: anything else, a board with too few corners, or one with more squares than there are markers.
     """
     match = _SPECIFICATION.fullmatch(text.strip())
     if match is None:

@@ -37,9 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _lines(settings: Any, comments: Any, indent: str = "") -> Iterator[str]:
     """The YAML of a dataclass with the comments of its fields."""
-    import yaml
-
-    from improvo.config import to_dict
+    from improvo.config import to_dict, yaml_line
 
     plain = to_dict(settings)
     for field in dataclasses.fields(settings):
@@ -50,5 +48,4 @@ def _lines(settings: Any, comments: Any, indent: str = "") -> Iterator[str]:
             yield f"{indent}{field.name}:{note}"
             yield from _lines(value, comments, f"{indent}  ")
         else:
-            text = yaml.safe_dump(plain[field.name], default_flow_style=True, width=1000).splitlines()[0]
-            yield f"{indent}{field.name}: {text}{note}"
+            yield f"{indent}{field.name}: {yaml_line(plain[field.name])}{note}"

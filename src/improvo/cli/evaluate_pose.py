@@ -268,10 +268,13 @@ def _export(arguments: argparse.Namespace) -> int:
     """Write the frames that the evaluation will use, as delivered, for a frontend that runs elsewhere."""
 
     from improvo.evaluation.pose.pairs import pairs_of_sequence
-    from improvo.files import make_output_folder, write_picture
+    from improvo.evaluation.sources import refuse_equal_names
+    from improvo.files import check_output_folder, make_output_folder, write_picture
 
-    make_output_folder(arguments.export_images, f"{COMMAND} --export-images")
+    check_output_folder(arguments.export_images, f"{COMMAND} --export-images")
     settings, sources = _settings(arguments)
+    refuse_equal_names("sequences", [source.open().name for source in sources])
+    make_output_folder(arguments.export_images, f"{COMMAND} --export-images")
     written = 0
     for source in sources:
         sequence = source.open()

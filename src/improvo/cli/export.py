@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from improvo.cli.flags import add_setting
 from improvo.cli.output import figures, next_step, say, typed
 from improvo.cli.show_options import add_recording, add_run_folder, target_path
-from improvo.errors import OutputError
+from improvo.errors import ConfigError, OutputError
 from improvo.files import check_output_file
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ def run_colmap(arguments: argparse.Namespace) -> None:
     from improvo.files import make_output_folder
     from improvo.odometry.run_folder import RunFolder
 
+    _check_model_arguments(arguments)
     run_folder = RunFolder(arguments.folder, arguments.sequence)
     segments = segments_by_length(run_folder)
     models = [segment_model(run_folder, each, arguments.max_error, arguments.min_observations) for each in segments]
@@ -73,6 +74,7 @@ def run_nerfstudio(arguments: argparse.Namespace) -> None:
     from improvo.files import make_output_folder
     from improvo.odometry.run_folder import RunFolder
 
+    _check_model_arguments(arguments)
     run_folder = RunFolder(arguments.folder, arguments.sequence)
     segments = segments_by_length(run_folder)
     model = segment_model(run_folder, segments[0], arguments.max_error, arguments.min_observations)
@@ -101,7 +103,7 @@ def run_trajectory(arguments: argparse.Namespace) -> None:
     run_folder = RunFolder(arguments.folder)
     target = target_path(arguments.output, arguments.output, _FILE_NAMES[arguments.format], (".txt", ".csv"))
     export_trajectory(run_folder.trajectory, run_folder.frames, target, arguments.format)
-    say(f"{target}: {len(run_folder.trajectory)} poses, camera-to-world, in map units")
+    say(f"{target}: {len(run_folder.trajectory)} poses, camera-to-world, {run_folder.unit}")
     next_step(f"`improvo evaluate trajectory {typed(target)} TRUTH` measures them")
 
 
@@ -152,6 +154,18 @@ def _add_model_arguments(parser: argparse.ArgumentParser, contents: str) -> None
     parser.add_argument("--max-error", type=float, default=4.0, metavar="PIXELS", help="drop observations beyond this")
     parser.add_argument("--min-observations", type=int, default=3, metavar="N", help="drop points with fewer")
     add_recording(parser)
+
+
+def _check_model_arguments(arguments: argparse.Namespace) -> None:
+    """Refuse what would leave nothing, or points that nothing was seen of.
+
+    Raises:
+        ConfigError: see above.
+    """
+    if not arguments.max_error > 0:
+        raise ConfigError(f"--max-error {arguments.max_error:g}: must be positive")
+    if arguments.min_observations < 1:
+        raise ConfigError(f"--min-observations {arguments.min_observations}: must be at least 1")
 
 
 def _write_images(run_folder: RunFolder, model: Model, folder: Path) -> UInt8:

@@ -34,6 +34,7 @@ _OUTPUTS = {"output", "save", "write_mask", "print_board"}  # arguments that nam
 _NO_MEMORY = "out of memory; give it more, or smaller pictures (--width), fewer keypoints or fewer --workers"
 _NO_FOLDER = "the folder that it runs in was removed; change to another one (cd) and run it again"
 _NO_SPACE = "no space is left on the disk; free some, or choose another folder"
+_NO_PERMISSION = "permission denied; choose another path, or change its permissions"
 _ERRORS_OF_NO_SPACE = {getattr(errno, name) for name in ("ENOSPC", "EDQUOT", "EFBIG") if hasattr(errno, name)}
 _WORDS_OF_NO_MEMORY = ("insufficient memory", "can't allocate memory", "out of memory", "bad_alloc", "start new thread")
 
@@ -148,6 +149,8 @@ def _limit_of_the_machine(error: Exception) -> str:
         return _NO_MEMORY
     if isinstance(error, OSError) and error.errno in _ERRORS_OF_NO_SPACE:
         return _NO_SPACE
+    if isinstance(error, PermissionError) and error.filename is not None:
+        return one_line(f"{os.fsdecode(error.filename)}: {_NO_PERMISSION}")
     return _NO_FOLDER if _folder_is_gone(error) else ""
 
 
@@ -168,7 +171,7 @@ def _folder_is_gone(error: Exception) -> bool:
 
 
 def _check_paths(arguments: argparse.Namespace) -> None:
-    """Refuse a path that no system can look up, and an output that is also the input, before any command does.
+    """Refuse a path that cannot or may not be looked up, and an output that is also the input, before any command does.
 
     Raises:
         InputError: there is such a path.
@@ -179,7 +182,7 @@ def _check_paths(arguments: argparse.Namespace) -> None:
 
     paths = {name: _paths(value) for name, value in vars(arguments).items()}
     for path in chain.from_iterable(paths.values()):
-        check_path(path)
+        check_path(path, reachable=True)
     for output_name in _OUTPUTS & paths.keys():
         others = chain.from_iterable(read for name, read in paths.items() if name not in _OUTPUTS)
         read = [path for path in others if path.is_file()]

@@ -162,15 +162,13 @@ def settings_from(
     Raises:
         ConfigError: an unknown setting or a value of the wrong type.
     """
-    import yaml
-
     if hasattr(arguments, "camera") and hasattr(arguments, "fov"):
         raise ConfigError(
             f"--camera {arguments.camera} and --fov {arguments.fov:g}: both say what the camera is; give one"
         )
     names = {**getattr(arguments, "flags", {}), **(flags or {})}
     given = [
-        f"{setting}={yaml.safe_dump(getattr(arguments, name), default_flow_style=True).splitlines()[0]}"
+        f"{setting}={config.yaml_line(getattr(arguments, name))}"
         for name, setting in names.items()
         if hasattr(arguments, name)
     ]

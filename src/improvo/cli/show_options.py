@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from improvo.cli.output import say
-from improvo.errors import ConfigError, OutputError
+from improvo.errors import ConfigError, InputError, OutputError
 from improvo.files import check_output_file
 from improvo.terminal import counted
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 _EVENLY = "6"  # frames of a sheet
 _MANY = 20  # frames that deserve a progress bar
+_FASTEST = 1000.0  # pictures a second of a video
 _LARGEST_SHEET = 60  # frames; more become files of their own
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 MOVING = (".mp4", ".webm", ".gif", ".webp")  # suffixes of `improvo.report.sheets`, which loads more
@@ -28,10 +29,14 @@ def add_run_folder(parser: argparse.ArgumentParser, made_by: str = "run") -> Non
     parser.add_argument("folder", type=Path, metavar="OUT", help=f"output folder of `improvo {made_by}`")
 
 
-def add_recording(parser: argparse.ArgumentParser) -> None:
-    """Where the recording of a run is now."""
+def add_recording(parser: argparse.ArgumentParser, name: str = "sequence") -> None:
+    """Where the recording of a run is now, as the argument `name`."""
     parser.add_argument(
-        "--sequence", type=Path, metavar="PATH", help="where the recording is now (default: where it was)"
+        "--sequence",
+        dest=name,
+        type=Path,
+        metavar="PATH",
+        help="where the recording of a run is now (default: where it was)",
     )
 
 
@@ -65,11 +70,15 @@ def add_frames(parser: argparse.ArgumentParser) -> None:
 def asked_frames(arguments: argparse.Namespace, count: int) -> list[int]:
     """The frames that the arguments of `add_frames` name, of `count`; what they say of the output is checked too."""
     video = _is_video(arguments)
+    if count == 0:
+        raise InputError(f"{vars(arguments).get('folder') or arguments.sequence}: has no frames to draw")
     which = "all" if video and arguments.frames == _EVENLY else arguments.frames
     frames = chosen_frames(which, count)
     output: Path | None = arguments.output
     if arguments.video_width is not None and arguments.video_width < 16:
         raise ConfigError(f"--video-width {arguments.video_width}: must be at least 16 pixels")
+    if arguments.video_fps is not None and not 0 < arguments.video_fps <= _FASTEST:
+        raise ConfigError(f"--video-fps {arguments.video_fps:g}: must be positive, and at most {_FASTEST:g}")
     if output is None or not output.suffix or video:
         return frames
     if arguments.each or len(frames) > _LARGEST_SHEET:

@@ -12,13 +12,14 @@ from improvo.cli.output import next_step, say
 from improvo.cli.show_options import (
     add_frames,
     add_palette,
+    add_recording,
     add_target,
     asked_frames,
     chosen_frames,
     target_path,
     write_pictures,
 )
-from improvo.errors import InputError
+from improvo.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from improvo.sequences import Sequence
@@ -50,7 +51,7 @@ def run_stability(arguments: argparse.Namespace) -> None:
     colours, shown_name = palette(arguments.palette), Path(name).stem
     frames = asked_frames(arguments, len(sequence))
     times = sequence.times
-    fps = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 30.0
+    fps = float((len(times) - 1) / (times[-1] - times[0])) if len(times) > 1 and times[-1] > times[0] else 30.0
 
     def painted(number: int) -> UInt8:
         frame = sequence[number]
@@ -110,32 +111,43 @@ def _pair(text: str, sequence: Sequence) -> list[int]:
     Raises:
         InputError: it names no two frames. ConfigError: there is no such frame.
     """
-    import numpy as np
-
     mend = InputError(f"--pair {text}: give two frames, such as 0,30, or 0,+5 (frames later), or 0,+1s (seconds later)")
     first, comma, second = text.partition(",")
     if not comma or not first.strip().isdecimal():
         raise mend
     if second.startswith("+"):
-        in_seconds = second.endswith("s")
-        try:
-            later = float(second[1:-1]) if in_seconds else float(int(second[1:]))
-        except ValueError:
-            raise mend from None
-        if in_seconds:
-            step = float(np.median(np.diff(sequence.times))) if len(sequence) > 1 else 1.0
-            later = max(1, round(later / step))
-        second = str(int(first) + int(later))
+        second = str(_later(int(first), second[1:], sequence, mend))
     frames = chosen_frames(f"{first},{second}", len(sequence), "--pair")
     if len(frames) != 2:
         raise mend
     return frames
 
 
+def _later(first: int, words: str, sequence: Sequence, mend: InputError) -> int:
+    """The frame so many frames, or seconds, after the first one: the nearest in time, and one at least."""
+    import numpy as np
+
+    try:
+        later = float(words[:-1]) if words.endswith("s") else int(words)
+    except ValueError:
+        raise mend from None
+    if not 0 < later < float("inf"):
+        raise mend
+    if isinstance(later, int) or first >= len(sequence) - 1:
+        return first + int(later)
+    times = sequence.times
+    step = float(np.median(np.diff(times)))
+    beyond = round((times[first] + later - times[-1]) / step)
+    if beyond > 0:
+        return len(times) - 1 + beyond
+    return max(first + 1, int(np.argmin(np.abs(times - (times[first] + later)))))
+
+
 def _add_recording(parser: argparse.ArgumentParser, default: str) -> None:
     parser.add_argument("sequence", type=recording_path, metavar="SEQUENCE", help="a recording, or the folder of a run")
     add_target(parser, default)
     add_palette(parser)
+    add_recording(parser, "recording")
 
 
 def _opened_sequence(arguments: argparse.Namespace) -> tuple[Sequence, str | None]:
@@ -146,7 +158,22 @@ def _opened_sequence(arguments: argparse.Namespace) -> tuple[Sequence, str | Non
 
     path: Path = arguments.sequence
     if (path / "run.json").is_file():
-        run_folder = RunFolder(path)
+        _refuse_reading_otherwise(path, arguments)
+        run_folder = RunFolder(path, arguments.recording)
         return run_folder.sequence, str(run_folder.report["configuration"]["frontend"]["name"])
+    if arguments.recording is not None:
+        raise ConfigError(f"--sequence {arguments.recording}: belongs to the folder of a run, and {path} is none")
     settings = with_found_camera(settings_from(RunSettings, arguments), [path], None, "show")
     return open_sequence(path, settings.sequence), None
+
+
+def _refuse_reading_otherwise(run: Path, arguments: argparse.Namespace) -> None:
+    """A run's recording is read as it was for the run.
+
+    Raises:
+        ConfigError: an option says otherwise.
+    """
+    given = [f"--{name.replace('_', '-')}" for name in arguments.flags if hasattr(arguments, name)]
+    given += [f"--{name}" for name in ("config", "set", "preset") if getattr(arguments, name, None)]
+    if given:
+        raise ConfigError(f"{given[0]}: {run} is a run, whose recording is read as it was then; name the recording")

@@ -18,7 +18,7 @@ from improvo.cli.show_options import (
     target_path,
     write_pictures,
 )
-from improvo.errors import InputError
+from improvo.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from improvo.report.track_pictures import FramePainter
@@ -29,6 +29,7 @@ def add_map_arguments(parser: argparse.ArgumentParser) -> None:
     add_run_folder(parser)
     add_target(parser, "OUT/pictures/map.png")
     add_palette(parser)
+    add_recording(parser)
     parser.add_argument("--last", type=int, default=30, metavar="N", help="poses drawn in black: the last window")
 
 
@@ -38,7 +39,9 @@ def run_map(arguments: argparse.Namespace) -> None:
     from improvo.report.map_picture import draw_map
     from improvo.report.palettes import palette
 
-    run_folder = RunFolder(arguments.folder)
+    if arguments.last < 1:
+        raise ConfigError(f"--last {arguments.last}: must be at least 1")
+    run_folder = RunFolder(arguments.folder, arguments.sequence)
     target = target_path(arguments.output, arguments.folder / "pictures", "map.png")
     draw_map(run_folder, target, palette(arguments.palette), arguments.last)
     say(str(target))

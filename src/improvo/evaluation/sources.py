@@ -168,7 +168,7 @@ def _weights_digest(name: str) -> str | None:
 
 def file_name(label: str) -> str:
     """A label as the name of a file or folder."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", label).strip(".") or "_"
+    return re.sub(r"[^\w.-]+", "_", label).strip(".") or "_"  # letters of any language
 
 
 def refuse_equal_names(what: str, names: list[str]) -> None:

@@ -6,7 +6,11 @@ from collections.abc import Sequence
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table with aligned columns: the first to the left, the others to the right."""
+    """A Markdown table with aligned columns: the first to the left, the others to the right.
+
+    Cells are names, too, of which any may have a bar or a line break in it.
+    """
+    header, *rows = ([cell.replace("|", "\\|").replace("\n", "\\n") for cell in row] for row in (header, *rows))
     widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
 
     def line(cells: Sequence[str]) -> str:

@@ -21,7 +21,7 @@ _EUROC_HEADER = (
 
 
 def export_trajectory(trajectory: Trajectory, frames: int, path: Path, format: str) -> None:
-    """Write camera-to-world poses. Lengths are in map units, even where the format's header says metres.
+    """Write camera-to-world poses. Lengths are those of the run, which may be up to scale though a header says metres.
 
     Args:
         trajectory: the frames with a pose.

@@ -37,10 +37,12 @@ def decode(
     keypoints = (
         refine(heat, pixels, settings.subpixel_radius) if settings.subpixel_radius else pixels.astype(np.float32)
     )
+    found = np.ones(len(keypoints), np.bool_)
     if settings.corner_radius:
         from improvo.frontend.corners import refine_to_corners
 
         keypoints, found = refine_to_corners(image, keypoints, settings.corner_radius)
+    if settings.subpixel_radius or settings.corner_radius:  # they moved: to one place, or to a masked pixel
         kept = first_at_place(keypoints)
         kept = kept[found[kept]]
         if mask is not None:

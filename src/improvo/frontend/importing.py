@@ -158,7 +158,7 @@ def convert(tensors: Tensors, source: str, licence: str) -> tuple[Weights, Layou
         licence: goes into the model card.
 
     Raises:
-        InputError: none of the three layouts, or tensors missing from it.
+        InputError: none of the three layouts, tensors missing from it, or a batch norm that it does not have.
     """
     fitting = next(((layout, found) for layout in reversed(LAYOUTS) if (found := layout.prefixes(tensors))), None)
     if fitting is None:
@@ -171,6 +171,13 @@ def convert(tensors: Tensors, source: str, licence: str) -> tuple[Weights, Layou
     tensors = {
         name.removeprefix(prefixes[0]): values for name, values in tensors.items() if name.startswith(prefixes[0])
     }
+    known_norms = {f"{norm}.running_mean" for _, norm in layout.names.values() if layout.normalisation != "none"}
+    unknown = sorted({name for name in tensors if name.endswith("running_mean")} - known_norms)
+    if unknown:
+        raise InputError(
+            f"{source}: {layout.name}, but it has `{unknown[0]}`; fold its batch norm into the convolutions, or save "
+            "the network of that layout alone"
+        )
     try:
         ours: dict[str, Float32] = {}
         for layer, (convolution, norm) in layout.names.items():

@@ -35,10 +35,12 @@ def without_masked(features: Features, mask: Mask | None) -> Features:
 
 
 def check_mask(mask: Mask | None, shape: tuple[int, ...]) -> None:
-    """Refuse a mask of another size than the image of a shape (H, W) or (H, W, 3).
+    """Refuse a mask of another size than the image of a shape (H, W) or (H, W, 3), and one of numbers.
 
     Raises:
         InputError: it is.
     """
+    if mask is not None and mask.dtype != np.bool_:
+        raise InputError(f"mask of type {mask.dtype}: give truth values, such as `mask > 0`")
     if mask is not None and mask.shape != shape[:2]:
         raise InputError(f"mask of shape {mask.shape} for an image of shape {shape[:2]}; they must be the same")

@@ -57,7 +57,10 @@ def load_frontend(
         frontend = NetworkFrontend(load_weights(find_weights(name)), settings, name=name)
     if not least_stability:
         return frontend
-    from improvo.frontend.stable_only import StableOnly
+    from improvo.frontend.stable_only import StableOnly, no_stability_head
+
+    if name in CLASSICAL or not frontend.weights.architecture.stability:  # type: ignore[attr-defined]
+        raise no_stability_head(name)
 
     return StableOnly(frontend, least_stability)
 

@@ -34,7 +34,10 @@ class StableOnly:
         """
         features = self.frontend(image) if mask is None else self.frontend(image, mask)
         if features.stability is None:
-            raise ConfigError(
-                f"frontend {self.name}: has no stability head, so least_stability must be 0; superpoint-vo has one"
-            )
+            raise no_stability_head(self.name)
         return features.take(features.stability >= self.least)
+
+
+def no_stability_head(name: str) -> ConfigError:
+    """What is told where a frontend has none."""
+    return ConfigError(f"frontend {name}: has no stability head, so least_stability must be 0; superpoint-vo has one")

@@ -43,7 +43,8 @@ def align_points(target: Float64, source: Float64, with_scale: bool) -> Similari
         with_scale: find the scale too; else it is 1.
 
     Raises:
-        InputError: fewer than three points, or all on one spot (rotation or scale undefined).
+        InputError: fewer than three points, or all of the source on one spot. Where those of the target are, the scale
+            found is 0; on one line, the rotation about it is any.
     """
     if len(target) < 3:
         raise InputError(f"alignment needs at least 3 common poses, there are {len(target)}")

@@ -94,8 +94,11 @@ def local_metres(latitude: Float64, longitude: Float64, height: Float64) -> Floa
 
 
 def time_in_seconds(text: str) -> float:
-    """A date and time (ISO 8601; UTC where no zone is given) in seconds since 1970, or a number as it is; else NaN."""
-    text = text.strip().strip("\"'")
+    """A date and time (ISO 8601; UTC where no zone is given) in seconds since 1970, or a number as it is; else NaN.
+
+    Either may have a decimal comma.
+    """
+    text = text.strip().strip("\"'").replace(",", ".")
     try:
         return float(text)
     except ValueError:

@@ -1,8 +1,9 @@
 """Time stamps in seconds, whatever unit they were written in: seconds, milliseconds, microseconds or nanoseconds.
 
-The unit is told by size. A date between 1990 and 2100 fits one unit only. Stamps that count from another start are
-whole numbers in units other than seconds, and the step between frames tells which. A step of 5 to 400 is that of a
-video in milliseconds, or of a time lapse in whole seconds: it is read as the first, and a note says so.
+The unit is told by size. A date between 1990 and 2100 fits one unit only, unless stamps count from another start: 2
+seconds in nanoseconds look like 2033 in seconds, but then a step between frames would be over an hour. Stamps from
+another start are whole numbers in units other than seconds, and the step between frames tells which. A step of 5 to 400
+is that of a video in milliseconds, or of a time lapse in whole seconds: it is read as the first, and a note says so.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ _DATES = (6.3e8, 4.2e9)  # seconds since 1970: 1990 to 2100
 # the smallest median step of whole numbers that is read as this unit
 _STEPS = (("nanoseconds", 4e6), ("microseconds", 4e3), ("milliseconds", 400.0))
 _VIDEO_STEP = 5.0  # milliseconds: 200 frames a second
+_LONGEST_STEP = 4e3  # seconds; whole numbers that are dates so far apart are none
 
 
 def in_seconds(stamps: Float64, of_video: bool = True) -> tuple[Float64, str | None]:
@@ -42,13 +44,14 @@ def unit_of(stamps: Float64, of_video: bool = True) -> str:
     if len(finite) == 0:
         return "seconds"
     middle = float(np.median(finite))
-    for unit, scale in UNITS.items():
-        if _DATES[0] <= middle / scale <= _DATES[1]:
-            return unit
     steps = np.diff(np.unique(finite))
-    if len(steps) == 0 or (finite != np.rint(finite)).any():
+    whole = len(steps) > 0 and not (finite != np.rint(finite)).any()
+    step = float(np.median(steps)) if whole else 0.0
+    for unit, scale in UNITS.items():
+        if _DATES[0] <= middle / scale <= _DATES[1] and step < _LONGEST_STEP * scale:
+            return unit
+    if not whole:
         return "seconds"
-    step = float(np.median(steps))
     if of_video and _VIDEO_STEP <= step <= _STEPS[-1][1]:
         return "milliseconds"
     return next((unit for unit, least in _STEPS if step >= least), "seconds")

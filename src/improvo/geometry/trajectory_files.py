@@ -1,7 +1,8 @@
 """Trajectory files as the field has them: TUM, KITTI and EuRoC in, TUM and KITTI out. All hold camera-to-world.
 
-A bad row (not numbers, NaN, no rigid motion) becomes a row without a pose and is named in the report; a file without
-any pose is an error. Rotations within 1e-2 of orthonormal are projected to SO(3): the pose files of 7-Scenes are
+A bad row (not numbers, NaN, no rigid motion) is named in the report. It becomes a row without a pose, or is left out
+where it has no time either; KITTI's rows, which have none, all keep their places. A file without any pose is an error.
+Rotations within 1e-2 of orthonormal are projected to SO(3): the pose files of 7-Scenes are
 orthonormal only to about 3e-4, which would show as degrees of rotation error.
 """
 
@@ -56,7 +57,7 @@ def read_trajectory_report(
     columns = {"tum": 8, "kitti": 12, "euroc": 8}.get(format)
     if columns is None:
         raise InputError(f"{path}: unknown trajectory format {format!r}; known: tum, kitti, euroc")
-    values, line_numbers, segment, malformed = _rows(lines, columns)
+    values, line_numbers, segment, malformed = _rows(lines, columns, all_count=format == "kitti")
     problems = _named("not numbers", malformed, "line")
     if len(values) == 0:
         raise InputError(f"{path}: has no row of {columns} numbers, so it is no {format.upper()} trajectory")
@@ -74,9 +75,10 @@ def read_trajectory_report(
         quat_xyzw = values[:, [5, 6, 7, 4]] if w_first else values[:, 4:8]
         matrices = _from_quaternions(quat_xyzw, values[:, 1:4])
     poses, not_finite, not_rigid = clean_poses(matrices)
-    problems += _named("NaN or infinite", line_numbers[not_finite], "line")
+    problems += _named("NaN or infinite", np.setdiff1d(line_numbers[not_finite], malformed), "line")
     problems += _named("not a rigid motion", line_numbers[not_rigid], "line")
     keep = np.isfinite(stamps)
+    problems += _named("no time", line_numbers[~keep], "line")
     order, repeated = increasing_order(stamps[keep])
     problems += (f"{repeated} rows repeat a time stamp and were dropped",) if repeated else ()
     poses, stamps, segment = poses[keep][order], stamps[keep][order], segment[keep][order]
@@ -169,8 +171,11 @@ def increasing_order(times: Float64) -> tuple[Int64, int]:
     return order[first], int((~first).sum())
 
 
-def _rows(lines: list[str], columns: int) -> tuple[Float64, Int64, Int64, Int64]:
-    """Rows of numbers, their line numbers (1-based) and segments; the line numbers of rows that are not."""
+def _rows(lines: list[str], columns: int, all_count: bool = False) -> tuple[Float64, Int64, Int64, Int64]:
+    """Rows of numbers, their line numbers (1-based) and segments; the line numbers of rows that are not.
+
+    With `all_count`, those are among the rows too, as NaN: their number is a row's time.
+    """
     values: list[list[float]] = []
     numbers: list[int] = []
     segments: list[int] = []
@@ -192,7 +197,9 @@ def _rows(lines: list[str], columns: int) -> tuple[Float64, Int64, Int64, Int64]
         if len(row) < columns:
             if values or malformed or any(is_number(field) for field in fields):  # else the names of the columns
                 malformed.append(number)
-            continue
+            if not (all_count and malformed and malformed[-1] == number):
+                continue
+            row = [float("nan")] * columns
         values.append(row)
         numbers.append(number)
         segments.append(segment)
@@ -258,7 +265,7 @@ def has_times(path: Path) -> bool:
     lines = read_text(path, "a trajectory", "give a TUM, KITTI or EuRoC file").splitlines()
     if _guess(lines, path) != "kitti":
         return True
-    return not _kitti_times(path, len(_rows(lines, 12)[0]))[1]
+    return not _kitti_times(path, len(_rows(lines, 12, all_count=True)[0]))[1]
 
 
 def _kitti_times(path: Path, count: int) -> tuple[Float64, tuple[str, ...]]:

@@ -63,15 +63,17 @@ class Workers:
                     yield function(task)
                     shown.advance()
                 return
-            with one_thread_each():  # submitting starts the processes
-                futures = [self._started().submit(with_errors_sent, function, task) for task in queue]
+            died = WorkerDiedError(f"{label}: a worker process died (out of memory?); run again with fewer workers")
+            try:
+                with one_thread_each():  # submitting starts the processes
+                    futures = [self._started().submit(with_errors_sent, function, task) for task in queue]
+            except BrokenProcessPool:  # between two rounds
+                raise died from None
             for future in futures:
                 try:
                     result = future.result()
                 except BrokenProcessPool:
-                    raise WorkerDiedError(
-                        f"{label}: a worker process died (out of memory?); run again with fewer workers"
-                    ) from None
+                    raise died from None
                 yield result
                 shown.advance()
 

@@ -82,7 +82,13 @@ def run_in_processes(
             while waiting or running:
                 while waiting and idle:
                     place, job = idle.pop(), waiting.popleft()
-                    running[pools[place].submit(with_errors_sent, _work, work, job)] = job, place
+                    try:
+                        future = pools[place].submit(with_errors_sent, _work, work, job)
+                    except BrokenProcessPool:  # it died while it had nothing to do
+                        pools[place].shutdown()
+                        pools[place] = ProcessPoolExecutor(1, context, _start, (counters[place], stop))
+                        future = pools[place].submit(with_errors_sent, _work, work, job)
+                    running[future] = job, place
                 done, _ = wait(running, timeout=POLL_SECONDS, return_when=FIRST_COMPLETED)
                 tell()
                 for future in done:

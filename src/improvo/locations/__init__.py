@@ -242,7 +242,7 @@ def _place_of(path: Path) -> Place | None:
     folder = cache / path.relative_to(cache).parts[0] / _FILES
     if folder not in _places:
         try:
-            state = json.loads((folder.parent / STATE).read_text())
+            state = json.loads((folder.parent / STATE).read_text(encoding="utf-8"))
             place = Place(str(state["url"]), folder, bool(state["writing"]))
         except (OSError, ValueError, LookupError, TypeError):
             return None

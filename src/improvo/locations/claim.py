@@ -21,6 +21,7 @@ BEAT_SECONDS = 15.0  # a request for each sequence in work
 _PATIENCE_BEATS = 5.0  # without a beat, after which the holder is dead
 _LOOK_SECONDS = 1.0
 _SETTLE_SECONDS = 1.0
+_LAST_BEAT_SECONDS = 30.0
 IsDead = Callable[[dict[str, Any]], bool]
 
 
@@ -63,11 +64,13 @@ class Claim:
             if now.get("token") != mine["token"]:
                 raise ClaimedError(now)
         self._released = threading.Event()
-        threading.Thread(target=self._beat, daemon=True, name="claim").start()
+        self._beats = threading.Thread(target=self._beat, daemon=True, name="claim")
+        self._beats.start()
 
     def release(self) -> None:
         """Let go, if nobody has taken it for dead meanwhile."""
         self._released.set()
+        self._beats.join(_LAST_BEAT_SECONDS)  # one that is on its way would make the file anew
         with suppress(Exception):
             if (read_claim(self._place, self._path) or {}).get("token") == self._mine["token"]:
                 self._place.fs.rm_file(self._target)
@@ -110,6 +113,9 @@ class Claim:
     def _beat(self) -> None:
         while not self._released.wait(BEAT_SECONDS):
             with suppress(Exception):  # a location that is away for a while
+                holder = _holder_at(self._place, self._target)
+                if holder is not None and holder.get("token") != self._mine["token"]:
+                    return  # this process slept for so long that it was taken for dead
                 self._write()
 
 
@@ -126,17 +132,17 @@ def read_claim(place: Place, path: Path) -> dict[str, Any] | None:
         LocationReadError: the location does not answer.
     """
     target = place.remote(path)
+    return place.tries(lambda: _holder_at(place, target), "read", LocationReadError)
 
-    def read() -> bytes | None:
-        place.fs.invalidate_cache()
-        try:
-            content: bytes = place.fs.cat_file(target)
-        except FileNotFoundError:
-            return None
-        return content
 
-    content = place.tries(read, "read", LocationReadError)
-    return None if content is None else holder_in(content)
+def _holder_at(place: Place, target: str) -> dict[str, Any] | None:
+    """As `read_claim`, with one try."""
+    place.fs.invalidate_cache()
+    try:
+        content: bytes = place.fs.cat_file(target)
+    except FileNotFoundError:
+        return None
+    return holder_in(content)
 
 
 def holder_in(content: bytes) -> dict[str, Any]:

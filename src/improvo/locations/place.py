@@ -6,8 +6,9 @@ import json
 import os
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,6 +23,8 @@ RECORD = "label.json"  # of a sequence of labels; it is sent last
 _KEPT_HIDDEN = re.compile(re.escape(MARKER) + r"|\..+\.failed\.json")  # hidden files that belong to a folder's content
 _LOCK = re.compile(r"\.[^/]+\.lock")
 _WAITS = (0.5, 2.0, 8.0)  # seconds between tries
+# What changes whenever a file is written anew, as file systems name it: S3, Azure, Google, SFTP, ..., in memory.
+_VERSIONS = ("ETag", "etag", "md5Hash", "mtime", "LastModified", "last_modified", "updated", "modified", "created")
 # On S3, the tries here are the only ones: botocore's and s3fs's own, one within the other, would take many minutes.
 _S3 = {"retries": {"total_max_attempts": 1}, "connect_timeout": 10, "read_timeout": 30}
 
@@ -41,7 +44,9 @@ class Place:
         self.url, self.folder, self.writing = url, folder, writing
         self.listing: dict[str, int] = {}  # bytes of every file at the location, by its name in the folder
         self.locks: list[str] = []  # names of lock files at the location
-        self._sent: dict[str, list[int]] = {}  # bytes and time of every local file that is the one at the location
+        self._versions: dict[str, str] = {}  # of the files of the listing; empty where the location tells none
+        # bytes and time of every local file that is the one at the location, and the version that it has there
+        self._sent: dict[str, list[Any]] = {}
         self._process = -1
         self._away = False  # it did not answer last time: one try is enough to see whether it is back
         self._state = folder.parent / STATE
@@ -67,15 +72,15 @@ class Place:
 
     def open(self) -> None:
         """Know what is there, and fetch it; of a label store only the records, its tables are fetched one by one."""
-        with suppress(OSError, ValueError, TypeError):
-            self._sent = dict(json.loads(self._state.read_text())["sent"])
+        with suppress(OSError, ValueError, TypeError, LookupError):
+            self._sent = dict(json.loads(self._state.read_text(encoding="utf-8"))["sent"])
         found = self.tries(self._find, "read", LocationReadError)
         self.listing = {name: size for name, size in found.items() if name}
-        for name, (size, _) in list(self._sent.items()):
+        for name in list(self._sent):
             path = self.folder / name
             if not self._is_sent(path) and path.exists():
                 continue  # changed here and not sent
-            if self.listing.get(name) != size:  # changed there
+            if self._is_changed_there(name):
                 if name != MARKER:  # whose the folder is stays true
                     path.unlink(missing_ok=True)
                 del self._sent[name]
@@ -102,18 +107,18 @@ class Place:
         """Know whether a file is there now."""
         target = self.remote(path)
 
-        def ask() -> int | None:
+        def ask() -> dict[str, Any] | None:
             self.fs.invalidate_cache()
             try:
-                return int(self.fs.info(target).get("size") or 0)
+                return dict(self.fs.info(target))
             except FileNotFoundError:
                 return None
 
-        size = self.tries(ask, "read", LocationReadError)
-        if size is None:
-            self.listing.pop(self.name(path), None)
+        found, name = self.tries(ask, "read", LocationReadError), self.name(path)
+        if found is None:
+            self.listing.pop(name, None)
         else:
-            self.listing[self.name(path)] = size
+            self.listing[name], self._versions[name] = int(found.get("size") or 0), _version(found)
 
     def fetch(self, path: Path) -> None:
         """Bring a file here, if it is there; it appears as a whole."""
@@ -143,6 +148,7 @@ class Place:
 
         self.tries(put, "written", LocationWriteError)
         self.listing[self.name(path)] = path.stat().st_size
+        self._versions[self.name(path)] = self._version_of(target)
         self._note(path)
         self._remember()
 
@@ -219,29 +225,51 @@ class Place:
             found = fs.find(root, detail=True)
         except FileNotFoundError:
             return {}
-        sizes = {full.removeprefix(root).lstrip("/"): int(entry.get("size") or 0) for full, entry in found.items()}
-        self.locks = [name for name in sizes if _LOCK.fullmatch(name)]
-        return {name: size for name, size in sizes.items() if name and belongs(name)}
+        entries = {full.removeprefix(root).lstrip("/"): entry for full, entry in found.items()}
+        self.locks = [name for name in entries if _LOCK.fullmatch(name)]
+        self._versions = {name: _version(entry) for name, entry in entries.items()}
+        return {name: int(entry.get("size") or 0) for name, entry in entries.items() if name and belongs(name)}
+
+    def _is_changed_there(self, name: str) -> bool:
+        """Whether the location has another file now; networks of one architecture, for one, all have one size."""
+        size, _, *versions = self._sent[name]
+        if self.listing.get(name) != size:
+            return True
+        before, now = versions[0] if versions else "", self._versions.get(name, "")
+        return bool(before and now) and before != now
+
+    def _version_of(self, target: str) -> str:
+        """Of a file that was just sent; empty where the location does not tell."""
+        with suppress(Exception):
+            self.fs.invalidate_cache()
+            return _version(self.fs.info(target))
+        return ""
 
     def _is_sent(self, path: Path) -> bool:
         try:
             state = path.stat()
         except OSError:
             return False
-        return self._sent.get(self.name(path)) == [state.st_size, state.st_mtime_ns]
+        return self._sent.get(self.name(path), [])[:2] == [state.st_size, state.st_mtime_ns]
 
     def _note(self, path: Path) -> None:
-        state = path.stat()
-        self._sent[self.name(path)] = [state.st_size, state.st_mtime_ns]
+        state, name = path.stat(), self.name(path)
+        self._sent[name] = [state.st_size, state.st_mtime_ns, self._versions.get(name, "")]
 
     def _remember(self) -> None:
-        others: dict[str, list[int]] = {}  # of other processes
+        others: dict[str, list[Any]] = {}  # of other processes
         with suppress(OSError, ValueError, TypeError, LookupError):
-            others = json.loads(self._state.read_text())["sent"]
+            others = json.loads(self._state.read_text(encoding="utf-8"))["sent"]
         content = json.dumps({"url": self.url, "writing": self.writing, "sent": {**others, **self._sent}})
         temporary = self._state.with_suffix(f".{os.getpid()}")
-        temporary.write_text(content)
+        temporary.write_text(content, encoding="utf-8")
         os.replace(temporary, self._state)
+
+
+def _version(entry: Mapping[str, Any]) -> str:
+    """What tells a file from a later one of the same name and size; empty where the file system has nothing."""
+    found = next((entry[name] for name in _VERSIONS if entry.get(name)), "")
+    return str(found.timestamp() if isinstance(found, datetime) else found).strip('"')
 
 
 def belongs(name: str) -> bool:

@@ -33,6 +33,7 @@ from improvo.odometry.trajectory_builder import FinalView
 from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
 from improvo.odometry.visualizer import NullVisualizer, Visualizer
 from improvo.sequences import Sequence
+from improvo.sequences.given_files import with_absolute_files
 from improvo.terminal import counted
 from improvo.types import Trajectory
 
@@ -198,7 +199,7 @@ def _report(
     return {
         FORMAT_KEY: FORMAT,
         "input": {
-            "path": str(sequence.path),
+            "path": str(sequence.path if sequence.length is None else sequence.path.absolute()),
             "format": sequence.format,
             "frames": len(processed) if sequence.length is None else sequence.length,
             "first_time": _number(trajectory.times[0] if len(trajectory) else np.nan),
@@ -209,7 +210,7 @@ def _report(
         },
         "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
         "frontend": frontend.name,
-        "configuration": to_dict(settings),
+        "configuration": to_dict(_found_from_anywhere(settings)),
         "seed": settings.odometry.seed,
         "versions": _versions(),
         "interrupted": interrupted,
@@ -235,6 +236,14 @@ def _report(
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "frames_per_second": round(len(processed) / max(seconds["total"], 1e-9), 2),
     }
+
+
+def _found_from_anywhere(settings: RunSettings) -> RunSettings:
+    """The settings with absolute paths, since pictures and pages of the run may be made from another folder."""
+    frontend = settings.frontend
+    if frontend.name.endswith(".safetensors"):
+        frontend = replace(frontend, name=str(Path(frontend.name).absolute()))
+    return replace(settings, sequence=with_absolute_files(settings.sequence), frontend=frontend)
 
 
 def _number(value: float) -> float | None:

@@ -70,7 +70,7 @@ class RunFolder:
             report = _with_present_names(read_json_file(path / "run.json", "run `improvo run` again"))
             self.report: dict[str, Any] = _told_where(report, f"{path / 'run.json'}")
             check_format(self.report.get(FORMAT_KEY), path / "run.json", "run `improvo run` again")
-            self._recorded_input = check_path(Path(self.report["input"]["path"]))
+            self.recorded_input = check_path(Path(self.report["input"]["path"]))
             self.source_index: list[int] = self.report["frames"]["source_index"]
             _check(self.report)
         except FileNotFoundError:
@@ -81,7 +81,7 @@ class RunFolder:
     @property
     def name(self) -> str:
         """The recording's name."""
-        return as_text(self._recorded_input.name or str(self._recorded_input))
+        return as_text(self.recorded_input.name or str(self.recorded_input))
 
     @property
     def unit(self) -> str:
@@ -153,7 +153,7 @@ class RunFolder:
         own = self.path / "camera.yaml"  # found for this run (`--camera auto`), which may have been moved
         if settings.camera is not None and own.is_file() and Path(settings.camera).name == own.name:
             settings = replace(settings, camera=str(own))
-        path = self._sequence_path or self._recorded_input
+        path = check_path(self._sequence_path or self.recorded_input, reachable=True)
         if not path.exists():
             raise InputError(f"{path}: the recording is not there any more; name it with --sequence PATH")
         sequence = open_sequence(path, settings)

@@ -14,6 +14,8 @@ _SHIFT = 4  # OpenCV's fixed-point digits
 _TARGET_WIDTH = 1280  # small frames are enlarged to about this, so that lines and letters are crisp
 _BAR_HEIGHT = 30
 _PLAIN_WIDTH = 760  # pixels of a picture with letters of plain size
+_MARGIN = 8  # pixels beside the text
+_SMALLEST = 0.4  # of plain letters; a text that is longer even so is cut
 _LETTERS = (235, 235, 235)
 
 
@@ -76,23 +78,34 @@ class Canvas:
 
 
 def captioned(rgb: UInt8, text: str, ramp: tuple[UInt8, str, str] | None = None) -> UInt8:
-    """A picture with a caption bar below; letters grow with the picture, and shrink for text that does not fit."""
+    """A picture with a caption bar below; letters grow with the picture, and shrink for text that does not fit.
+
+    The bar's height follows from the picture's width alone, so that pictures of one size stay of one size. A text that
+    is too long even so is cut; a ramp that would leave no room for the text is left out.
+    """
     import cv2
 
     width = rgb.shape[1]
     unit = max(1.0, width / _PLAIN_WIDTH)
+    thickness = max(1, round(unit))
     bar = np.full((round(_BAR_HEIGHT * unit), width, 3), 24, np.uint8)
-    right = width - 8 if ramp is None else _draw_ramp(bar, *ramp, unit=unit)
-    font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * unit
-    text_width = cv2.getTextSize(text, font, size, 1)[0][0]
-    size *= min(1.0, max(0.3, (right - 16) / max(text_width, 1)))
-    baseline = round(20 * unit)
-    cv2.putText(bar, text, (8, baseline), font, size, _LETTERS, max(1, round(unit)), cv2.LINE_AA)
+    right = width - _MARGIN if ramp is None else _draw_ramp(bar, *ramp, unit=unit)
+    font, plain, room = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * unit, right - 2 * _MARGIN
+
+    def length(words: str, size: float) -> int:
+        return int(cv2.getTextSize(words, font, size, thickness)[0][0])
+
+    size = plain * min(1.0, max(_SMALLEST, room / max(length(text, plain), 1)))
+    shown = text
+    while length(shown, size) > room and shown not in ("", "..."):
+        shown = shown.removesuffix("...")[:-1] + "..."
+    if length(shown, size) <= room:
+        cv2.putText(bar, shown, (_MARGIN, round(20 * unit)), font, size, _LETTERS, thickness, cv2.LINE_AA)
     return np.concatenate([rgb, bar])
 
 
 def _draw_ramp(bar: UInt8, colours: UInt8, low: str, high: str, unit: float) -> int:
-    """Draws the ramp at the right end of the bar; returns where the room for text ends."""
+    """Draws the ramp at the right end of the bar, where it leaves room; returns where the room for text ends."""
     import cv2
 
     font, size, thickness = cv2.FONT_HERSHEY_SIMPLEX, 0.45 * unit, max(1, round(unit))
@@ -101,6 +114,8 @@ def _draw_ramp(bar: UInt8, colours: UInt8, low: str, high: str, unit: float) -> 
     low_width = cv2.getTextSize(low, font, size, thickness)[0][0]
     end = bar.shape[1] - 2 * gap - high_width
     start = end - length
+    if start - low_width - 2 * gap < bar.shape[1] // 4:
+        return bar.shape[1] - _MARGIN
     sampled = colours[np.linspace(0, len(colours) - 1, length).astype(int)]
     bar[round(8 * unit) : round(22 * unit), start:end] = sampled[None]
     cv2.putText(bar, high, (end + gap, baseline), font, size, _LETTERS, thickness, cv2.LINE_AA)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from improvo.errors import InputError
-from improvo.report.page import Page
-from improvo.untrusted.text import read_json_file
+from improvo.report.page import Page, as_json
+from improvo.untrusted.text import read_json_file, reason
 
 # evaluation -> (title, what the numbers mean)
 EVALUATIONS = {
@@ -64,10 +63,14 @@ def write_evaluation_page(folder: Path, path: Path) -> None:
 
 
 def _tables(page: Page, folder: Path, name: str) -> None:
+    path, mend = folder / f"{name}.md", f"run `improvo evaluate {name}` again"
     try:
-        page.markdown((folder / f"{name}.md").read_text())
-    except OSError:
-        raise InputError(f"{folder / name}.md: is missing; run `improvo evaluate {name}` again") from None
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: is missing; {mend}") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: is damaged ({reason(error)}); {mend}") from None
+    page.markdown(text)
 
 
 def _subject(path: Path) -> str:
@@ -100,5 +103,5 @@ _LONGEST = 200_000  # characters of a result that are worth embedding
 
 
 def _indented(path: Path) -> str:
-    text = json.dumps(_read(path), indent=1)
+    text = as_json(_read(path))
     return text if len(text) <= _LONGEST else text[:_LONGEST] + f"\n... {len(text) - _LONGEST} more characters"

@@ -37,6 +37,7 @@ def write_label_page(folder: Path, path: Path, palette: Palette = PALETTES["pape
     page = Page(
         f"Labels of {_named([str(row['name']) for row in rows])}",
         f"{counted(len(rows), 'sequence')}, labelled by the command improvo label.",
+        folders=[Path(str(row["path"])).parent for row in rows],
     )
     page.tiles(
         [
@@ -72,4 +73,4 @@ def _named(names: list[str]) -> str:
 
 
 def _words(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else ("-" if value is None else str(value))
+    return f"{value:,.1f}" if isinstance(value, float) else ("-" if value is None else str(value))

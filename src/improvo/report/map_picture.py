@@ -61,9 +61,10 @@ def map_png(
     if len(trajectory) == 0:
         raise InputError(f"{run.path}: no frame has a pose, so there is no map to draw; see `events` in run.json")
     axes_of_world = overhead_axes(trajectory.world_from_cam)
-    path_2d = axes_of_world.project(trajectory.camera_centers)
+    first = trajectory.camera_centers[0]  # where the axes begin
+    path_2d = axes_of_world.project(trajectory.camera_centers - first)
     shown = trusted_points(run.map)
-    points_2d = axes_of_world.project(run.map.xyz[shown])
+    points_2d = axes_of_world.project(run.map.xyz[shown] - first)
     low, high = robust_limits(path_2d, points_2d)
     width, height = _figure_size(high - low)
     if narrow:
@@ -88,7 +89,8 @@ def map_png(
 
     links = np.stack([path_2d[:-1], path_2d[1:]], axis=1)
     joined = trajectory.segment[:-1] == trajectory.segment[1:]
-    colours = palette.ramp_colours(run.frame_indices[1:].astype(float), 0, max(run.frames - 1, 1)) / 255.0
+    of_poses = palette.ramp_colours(run.frame_indices.astype(float), 0, max(run.frames - 1, 1)) / 255.0
+    colours = of_poses[1:]
     axis.add_collection(
         LineCollection(list(links[joined]), colors=colours[joined], linewidths=3.0, capstyle="round", zorder=3)
     )
@@ -100,19 +102,21 @@ def map_png(
         LineCollection(list(links[doubted]), colors=_DOUBTED, linewidths=8.0, capstyle="round", alpha=0.8, zorder=2)
     )
     last = path_2d[-last_poses:]
-    axis.plot(*last.T, color="white", linewidth=5.5, solid_capstyle="round", zorder=4)
-    axis.plot(*last.T, color="black", linewidth=3.5, solid_capstyle="round", zorder=5)
-    axis.plot(*path_2d[0], "o", color=tuple(colours[0]), markeredgecolor="white", markersize=8, zorder=6)
+    for number in np.unique(trajectory.segment[-last_poses:]):  # no black line leads from one to the next
+        here = last[trajectory.segment[-last_poses:] == number]
+        axis.plot(*here.T, color="white", linewidth=5.5, solid_capstyle="round", zorder=4)
+        axis.plot(*here.T, color="black", linewidth=3.5, solid_capstyle="round", zorder=5)
+    axis.plot(*path_2d[0], "o", color=tuple(of_poses[0]), markeredgecolor="white", markersize=8, zorder=6)
     axis.annotate("start", path_2d[0], (6, 6), textcoords="offset points", color="white", fontsize=9, zorder=7)
     for number in np.unique(trajectory.segment)[1:]:
-        first = path_2d[np.flatnonzero(trajectory.segment == number)[0]]
+        start = path_2d[np.flatnonzero(trajectory.segment == number)[0]]
         axis.annotate(
-            f"segment {number}", first, (6, -12), textcoords="offset points", color="white", fontsize=8, zorder=7
+            f"segment {number}", start, (6, -12), textcoords="offset points", color="white", fontsize=8, zorder=7
         )
 
     truth = true_path(run)
     if truth is not None:
-        true_2d = axes_of_world.project(truth.centers)
+        true_2d = axes_of_world.project(truth.drawn() - first)
         for number in np.unique(trajectory.segment):
             axis.plot(
                 *np.where((trajectory.segment == number)[:, None], true_2d, np.nan).T,
@@ -122,7 +126,14 @@ def map_png(
                 zorder=8,
                 label="true path, aligned" if number == trajectory.segment[0] else None,
             )
-        axis.legend(loc="best", fontsize=8, facecolor=_BACKGROUND, labelcolor="white", framealpha=0.8)
+        is_below = float(np.median(path_2d[:, 1])) < (low[1] + high[1]) / 2  # where the path is, the legend is not
+        axis.legend(
+            loc="upper left" if is_below else "lower left",
+            fontsize=8,
+            facecolor=_BACKGROUND,
+            labelcolor="white",
+            framealpha=0.8,
+        )
 
     axis.set_xlim(low[0], high[0])
     axis.set_ylim(low[1], high[1])

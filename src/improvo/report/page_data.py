@@ -50,7 +50,7 @@ def scene_data(run: RunFolder, palette: Palette, truth: TruePath | None = None) 
             "labels": _layer(label_points, palette.label_colours(run.points.stability[label_rows])),
         },
         "poses": _base64(poses.astype("<f4")),
-        "truth": None if truth is None else _base64((truth.centers @ scene_from_world.T).astype("<f4")),
+        "truth": None if truth is None else _base64((truth.drawn() @ scene_from_world.T).astype("<f4")),
         "frame_indices": run.frame_indices.tolist(),
         "segments": trajectory.segment.tolist(),
         "doubted": (run.doubtful | run.uncertain).tolist(),
@@ -107,6 +107,7 @@ def frames_data(
     data = {
         "frames": shown,
         "width": run.camera.width,
+        "parts": pixel_parts(run.camera.width, run.camera.height),
         "young": int(255 * 2 / old),  # ages are stored as shares of `old`
         "ramp": palette.ramp_strip(256).reshape(-1).tolist(),
         "labels": palette.label_colours(np.arange(3)).reshape(-1).tolist(),
@@ -114,8 +115,13 @@ def frames_data(
     return data, np.array(brightness)
 
 
+def pixel_parts(width: int, height: int) -> int:
+    """Into how many parts a pixel can be divided such that two bytes count those of the longer side."""
+    return max(1, min(16, 65536 // max(width, height)))
+
+
 def _packed_points(run: RunFolder, frame: int, old: int, large_error: float) -> NDArray[np.void]:
-    """The tracks of a frame: where they are and were, in 1/16 px, and age, error and label as bytes."""
+    """The tracks of a frame: where they are and were, in parts of a pixel, and age, error and label as bytes."""
     seen = run.observations(frame)
     row = np.dtype([("now", "<u2", 2), ("before", "<u2", 2), ("age", "u1"), ("error", "u1"), ("label", "u1")])
     packed = np.zeros(len(seen), row)
@@ -127,8 +133,9 @@ def _packed_points(run: RunFolder, frame: int, old: int, large_error: float) -> 
         # where a link jumps, only the part after the jump is drawn
         followed &= (rows >= 0) & (np.linalg.norm(earlier - before, axis=1) < _JUMP_SHARE * run.camera.width)
         before[followed] = earlier[followed]
-    packed["now"] = np.clip(np.round(seen.keypoints * 16), 0, 65535)
-    packed["before"] = np.clip(np.round(before * 16), 0, 65535)
+    parts = pixel_parts(run.camera.width, run.camera.height)
+    packed["now"] = np.clip(np.round(seen.keypoints * parts), 0, 65535)
+    packed["before"] = np.clip(np.round(before * parts), 0, 65535)
     packed["age"] = np.clip(seen.age / old * 255, 0, 255)
     error = np.clip(np.nan_to_num(seen.error) / large_error, 0, 1) * (_NO_ERROR - 1)
     packed["error"] = np.where(np.isfinite(seen.error), error, _NO_ERROR)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from improvo.errors import InputError
+from improvo.errors import ConfigError, InputError
 from improvo.report.palettes import PALETTES, Palette
 
 
@@ -21,7 +21,10 @@ def write_report(
 
     Raises:
         InputError: the folder has no results that a page can be made of.
+        ConfigError: the place of a recording, for what is no run.
     """
+    if sequence_path is not None and not (folder / "run.json").is_file():
+        raise ConfigError(f"--sequence {sequence_path}: belongs to the folder of a run, and {folder} is none")
     if (folder / "run.json").is_file():
         from improvo.odometry.run_folder import RunFolder
         from improvo.report.run_page import write_run_page
@@ -30,7 +33,7 @@ def write_report(
     elif (folder / "manifest.parquet").is_file():
         from improvo.report.label_page import write_label_page
 
-        write_label_page(folder, path)
+        write_label_page(folder, path, palette)
     elif any((folder / name).is_file() for name in _evaluations()):
         from improvo.report.evaluation_page import write_evaluation_page
 

@@ -24,7 +24,9 @@ from improvo.stability.rule import IGNORE
 from improvo.types import Float64, Frame, UInt8
 
 _OLD = 30  # frames; the last colour of the age of a track
-_MAP_EVERY = 10  # frames between two pictures of the whole map
+_MAP_EVERY = 10  # frames between two pictures of the whole map, at least
+_MAP_GROWTH = 1.1  # of its points between two such pictures: all of them together stay a few times the last one
+_PIECE = 100  # poses of the trajectory that are sent anew with every frame; what lies behind stays as it is
 
 
 class RerunViewer:
@@ -44,8 +46,11 @@ class RerunViewer:
         self.failure: OutputError | None = None  # of the file to save, when the run is over
         self._palette = palette
         self._births: dict[int, int] = {}  # track -> the frame where it began
-        self._path: list[Float64] = []
+        self._path: list[Float64] = []  # the newest piece
+        self._pieces = 0  # behind it
         self._world = -1
+        self._map: Float64 = np.zeros((0, 3))  # the newest one
+        self._map_shown = 0  # points of the last picture of it
         self._last_shown = time.perf_counter()
 
     def begin(self, camera: Camera) -> None:
@@ -73,20 +78,37 @@ class RerunViewer:
         assert view.cam_from_world is not None
         world_from_cam = se3.inverse(view.cam_from_world)
         if view.world != self._world:  # another world: no line leads there
-            self._world, self._path = view.world, []
+            self._world, self._path, self._pieces, self._map_shown = view.world, [], 0, 0
+            self._recording.clear("world/trajectory")
         self._path.append(world_from_cam[:3, 3])
-        self._recording.pose(world_from_cam)
-        self._recording.trajectory(np.array(self._path), self._palette)
-        if len(points) and view.frame_index % _MAP_EVERY == 0:
-            self._recording.points(points, np.full((len(points), 3), 200, np.uint8))
+        self._show_path()
+        self._map = points
+        if view.frame_index % _MAP_EVERY == 0 and len(points) > _MAP_GROWTH * self._map_shown:
+            self._show_map()
         seen = view.points[view.observed]
         if len(seen) and int(seen.max()) < len(points):
             weights = view.weights[view.observed]  # stability, or 1 without that head
             self._recording.points(points[seen], self._palette.ramp_colours(1 - weights, 0, 1), "world/observed")
 
+    def _show_path(self) -> None:
+        """The newest piece from early to late; a piece that is full stays behind in the early colour."""
+        place = f"world/trajectory/{self._pieces}"
+        if len(self._path) <= _PIECE:
+            self._recording.trajectory(np.array(self._path), self._palette, place)
+            return
+        early = self._palette.ramp_strip(1)
+        self._recording.links(np.array(self._path), np.repeat(early, len(self._path) - 1, axis=0), place)
+        self._path, self._pieces = self._path[-1:], self._pieces + 1
+
+    def _show_map(self) -> None:
+        self._recording.points(self._map, np.full((len(self._map), 3), 200, np.uint8))
+        self._map_shown = len(self._map)
+
     def end(self) -> None:
         """The run is over. What the file could not hold must not cost its results, so `failure` keeps the error."""
         try:
+            if len(self._map):
+                self._show_map()
             self._recording.close()
         except OutputError as error:
             self.failure = error
@@ -103,19 +125,23 @@ def show_run(
         palette: colours.
         images: show the frames too; needs the recording.
     """
+    if images:
+        _ = run.sequence  # said before a file is begun, where it is not there any more
     recording = _Recording(save)
     recording.open(run.camera)
     row_of_frame = {int(frame): row for row, frame in enumerate(run.frame_indices)}
-    times = run.sequence.times if images else np.zeros(0)
+    times = _times(run)
     labelled = np.flatnonzero((run.points.stability != IGNORE) & np.isfinite(run.points.xyz).all(axis=1))
     recording.points(
         run.points.xyz[labelled], palette.label_colours(run.points.stability[labelled]), "world/labels", static=True
     )
     recording.points(run.map.xyz, map_colours(run.map), static=True)
-    recording.trajectory(run.trajectory.camera_centers, palette, static=True)
+    for segment in np.unique(run.trajectory.segment).tolist():  # no line leads from one to the next
+        here = run.trajectory.segment == segment
+        recording.trajectory(run.trajectory.camera_centers[here], palette, f"world/trajectory/{segment}", static=True)
     for frame in range(run.frames):
         row = row_of_frame.get(frame)
-        recording.at(frame, float(run.trajectory.times[row]) if row is not None else _time(times, run, frame))
+        recording.at(frame, float(times[frame]))
         if images:
             recording.image(run.image(frame))
         seen = run.observations(frame)
@@ -128,10 +154,17 @@ def show_run(
     recording.close()
 
 
-def _time(times: Float64, run: RunFolder, frame: int) -> float:
-    """Seconds of a frame without a pose."""
-    rows = np.flatnonzero(run.sequence.indices == run.source_index[frame]) if len(times) else np.zeros(0, np.int64)
-    return float(times[rows[0]]) if len(rows) else float(frame)
+def _times(run: RunFolder) -> Float64:
+    """(frames,) seconds; of frames without a pose as the frames with one tell, since the recording may be away."""
+    if len(run.trajectory) == 0:
+        return np.arange(run.frames, dtype=np.float64)
+    numbers = np.array(run.source_index, np.float64)
+    known = numbers[run.frame_indices]
+    times = np.interp(numbers, known, run.trajectory.times)
+    if len(known) > 1:
+        step = (run.trajectory.times[-1] - run.trajectory.times[0]) / (known[-1] - known[0])
+        times += step * (np.minimum(numbers - known[0], 0) + np.maximum(numbers - known[-1], 0))
+    return times
 
 
 class _Recording:
@@ -192,11 +225,17 @@ class _Recording:
     def points(self, xyz: Float64, colours: UInt8, path: str = "world/points", static: bool = False) -> None:
         self._log(path, self._rerun.Points3D(xyz, colors=colours, radii=self._rerun.Radius.ui_points(1.5)), static)
 
-    def trajectory(self, centres: Float64, palette: Palette, static: bool = False) -> None:
+    def trajectory(self, centres: Float64, palette: Palette, path: str, static: bool = False) -> None:
+        """From early to late."""
+        self.links(centres, palette.ramp_colours(np.arange(len(centres) - 1), 0, len(centres) - 1), path, static)
+
+    def links(self, centres: Float64, colours: UInt8, path: str, static: bool = False) -> None:
         if len(centres) > 1:
-            links = np.stack([centres[:-1], centres[1:]], axis=1)
-            colours = palette.ramp_colours(np.arange(len(links)), 0, len(links))
-            self._log("world/trajectory", self._rerun.LineStrips3D(links, colors=colours), static)
+            strips = np.stack([centres[:-1], centres[1:]], axis=1)
+            self._log(path, self._rerun.LineStrips3D(strips, colors=colours), static)
+
+    def clear(self, path: str) -> None:
+        self._log(path, self._rerun.Clear(recursive=True))
 
     def scalar(self, path: str, value: float) -> None:
         self._log(path, self._rerun.Scalars(value))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from improvo.odometry.verdict.told_verdicts import verdict_lines, verdict_of
 from improvo.odometry.verdict.verdict import DOUBTFUL
 from improvo.report.charts import line_chart
 from improvo.report.map_picture import map_png, trusted_points
-from improvo.report.page import Page, plain, swatch
+from improvo.report.page import Page, as_json, plain, swatch
 from improvo.report.page_data import frames_data, per_frame, scene_data
 from improvo.report.palettes import PALETTES, Palette
 from improvo.report.plain_words import LABEL_WORDS, warnings
@@ -75,6 +74,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
         f"Visual odometry of {run.name}",
         f"{frames['processed']} frames of {run.camera.width}x{run.camera.height}, {report['input']['format']}; "
         f"frontend {report['frontend']}; poses and map are {run.unit}.",
+        folders=[run.recorded_input.parent, run.path.absolute().parent],
     )
     tracks = run.points.counts()
     truth = true_path(run)
@@ -84,7 +84,7 @@ def write_run_page(run: RunFolder, path: Path, palette: Palette = PALETTES["pape
             (str(len(report["segments"])), "segments (1 is best)"),
             *_verdict_tile(report),
             (f"{report['points']:,}", "map points"),
-            *([(f"{_path_length(run):.4g} m", "path of the camera")] if report.get("metric") else []),
+            *([(_metres(_path_length(run)), "path of the camera")] if report.get("metric") else []),
             *([(f"{truth.ate_percent:.2g} %", "of the path off the true one (ATE)")] if truth is not None else []),
             (f"{median_error:.2f} px" if np.isfinite(median_error) else "-", "median re-projection error"),
             (f"{report['frames_per_second']:g}", "frames per second"),
@@ -120,6 +120,11 @@ def _path_length(run: RunFolder) -> float:
     """Summed over the segments."""
     steps = np.linalg.norm(np.diff(run.trajectory.camera_centers, axis=0), axis=1)
     return float(steps[np.diff(run.trajectory.segment) == 0].sum())
+
+
+def _metres(length: float) -> str:
+    """Four digits, and of what is longer than that all of them."""
+    return f"{length:.4g} m" if length < 1000 else f"{length:,.0f} m"
 
 
 def _map_section(page: Page, run: RunFolder, palette: Palette, truth: TruePath | None) -> None:
@@ -231,8 +236,8 @@ def _timing_section(page: Page, run: RunFolder) -> None:
         f"{camera['cx']:.2f}, cy {camera['cy']:.2f} px; images: {report['input']['view']}; "
         f"input {report['input']['path']}."
     )
-    page.details("All settings", json.dumps(report["configuration"], indent=2))
-    page.details("Versions", json.dumps(report["versions"], indent=2))
+    page.details("All settings", as_json(report["configuration"]))
+    page.details("Versions", as_json(report["versions"]))
 
 
 def _css(palette: Palette, label: str) -> str:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,8 @@ from improvo.untrusted.paths import is_text
 # VP8 takes thirty and VP9 a hundred, but browsers play only those two.
 _CODECS = {".mp4": ("mp4v", "vp09"), ".webm": ("VP80", "vp09")}
 _ANIMATIONS = (".gif", ".webp")  # by Pillow; for a page or a README
+_SLOWEST, _FASTEST = 0.5, 1000.0  # pictures a second; what is slower, WebM cannot hold
+_FASTEST_GIF = 50.0  # browsers show a picture of less than two hundredths of a second for ten of them
 MOVING = (*_CODECS, *_ANIMATIONS)
 
 
@@ -35,14 +40,16 @@ def write_video(path: Path, pictures: Iterable[UInt8], fps: float, width: int | 
 
     Args:
         path: its suffix, one of `MOVING`, says which.
-        pictures: RGB.
-        fps: pictures a second.
+        pictures: RGB, at least one.
+        fps: pictures a second, kept between 0.5 and 1000. A GIF, whose pictures stay for hundredths of a second and no
+            shorter than two, gets as many of them as it can show.
         width: pixels, to make them smaller; None keeps their size.
 
     Raises:
         OutputError: the file cannot be written.
     """
     pictures = (_resized(picture, width) for picture in pictures)
+    fps = min(max(fps, _SLOWEST), _FASTEST)
     if path.suffix.lower() in _ANIMATIONS:
         _write_animation(path, pictures, fps)
         return
@@ -50,7 +57,7 @@ def write_video(path: Path, pictures: Iterable[UInt8], fps: float, width: int | 
     height, width = (side - side % 2 for side in first.shape[:2])  # codecs want even sides
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages would drown the one line that says what to do
     with written_atomically(path) as temporary, _without_messages():
-        writer = _writer(temporary, _CODECS.get(path.suffix.lower(), ()), max(fps, 1.0), width, height)
+        writer = _writer(temporary, _CODECS.get(path.suffix.lower(), ()), fps, width, height)
         if writer is None:
             raise OutputError(f"{path}: OpenCV cannot write such a video here; try .mp4, or a folder for PNG files")
         try:
@@ -77,10 +84,15 @@ def _write_animation(path: Path, pictures: Iterator[UInt8], fps: float) -> None:
     """All pictures are in memory at once: these formats are for short ones."""
     from PIL import Image
 
-    first, *others = (Image.fromarray(picture) for picture in pictures)
-    more: dict[str, Any] = {"quality": 60, "method": 4} if path.suffix.lower() == ".webp" else {}
+    is_gif = path.suffix.lower() == ".gif"
+    every = math.ceil(round(fps / _FASTEST_GIF, 6)) if is_gif else 1
+    first, *others = (Image.fromarray(picture) for picture in islice(pictures, 0, None, every))
+    unit = 10 if is_gif else 1  # milliseconds
+    ends = [unit * round(number * every * 1000 / fps / unit) for number in range(len(others) + 2)]
+    durations = [end - begin for begin, end in pairwise(ends)]
+    more: dict[str, Any] = {} if is_gif else {"quality": 60, "method": 4}
     with written_atomically(path) as temporary:
-        first.save(temporary, save_all=True, append_images=others, duration=round(1000 / max(fps, 1.0)), loop=0, **more)
+        first.save(temporary, save_all=True, append_images=others, duration=durations, loop=0, **more)
 
 
 def _writer(path: Path, codecs: tuple[str, ...], fps: float, width: int, height: int) -> cv2.VideoWriter | None:  # type: ignore[name-defined] # noqa: F821
@@ -89,7 +101,8 @@ def _writer(path: Path, codecs: tuple[str, ...], fps: float, width: int, height:
     if not is_text(path):  # OpenCV ends the process
         return None
     for codec in codecs:
-        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), fps, (width, height))
+        with _nothing_on_stderr():
+            writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), fps, (width, height))
         if writer.isOpened():
             return writer
     return None
@@ -109,6 +122,26 @@ def _without_messages() -> Iterator[None]:
     finally:
         if log:
             log.setLogLevel(level)
+
+
+@contextmanager
+def _nothing_on_stderr() -> Iterator[None]:
+    """OpenCV says past its own log, to the process's stderr, that WebM knows no names of codecs."""
+    try:
+        before = os.dup(2)
+    except OSError:  # closed
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        if sys.stderr is not None:
+            sys.stderr.flush()
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(before, 2)
+        os.close(before)
+        os.close(nowhere)
 
 
 def _frames_in(path: Path) -> int:

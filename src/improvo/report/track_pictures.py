@@ -58,9 +58,10 @@ def paint_residuals(run: RunFolder, frame: int, settings: TrackPictureSettings |
     rows = rows[np.argsort(seen.error[rows], kind="stable")]  # large errors on top
     canvas.dots(seen.keypoints[rows], settings.palette.ramp_colours(seen.error[rows], 0, settings.large_error), 2.2)
     error = seen.error[rows]
-    middle = f"median {np.median(error):.2f} px, {(error > settings.large_error).mean():.0%} over" if len(rows) else "-"
+    over = f"{(error > settings.large_error).mean():.0%} over {settings.large_error:g} px" if len(rows) else ""
+    middle = f"; median {np.median(error):.2f} px, {over}" if len(rows) else ""
     return canvas.with_caption(
-        f"frame {frame}: re-projection error of {len(rows)} points; {middle} {settings.large_error:g} px",
+        f"frame {frame}: re-projection error of {len(rows)} points{middle}",
         (settings.palette.ramp_strip(), "0", f"{settings.large_error:g}+ px"),
     )
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from improvo.errors import InputError
 from improvo.geometry.alignment import align_points
 from improvo.odometry.run_folder import RunFolder
-from improvo.types import Float64
+from improvo.types import Float64, Int64
 
+_GAP = 10  # poses from one with truth to the next, which a line may bridge
 _FEWEST = 3  # poses of a segment that an alignment needs
 
 
@@ -21,6 +23,20 @@ class TruePath:
     centers: Float64  # (N, 3) in the world of the run, NaN where there is no truth
     errors: Float64  # (N,) distance of the estimate, in the run's unit
     ate_percent: float  # root mean square of the errors over the length of the true path
+    segment: Int64  # (N,) of each pose
+
+    def drawn(self) -> Float64:
+        """The centers (N, 3) as a line shows them: poses between two known ones nearby lie on the way.
+
+        Truth that is slower than the pictures would otherwise be dots, of which a line shows nothing.
+        """
+        found = self.centers.copy()
+        known = np.flatnonzero(np.isfinite(found).all(axis=1))
+        for first, last in pairwise(known.tolist()):
+            if 1 < last - first <= _GAP and self.segment[first] == self.segment[last]:
+                share = np.linspace(0, 1, last - first + 1)[1:-1, None]
+                found[first + 1 : last] = (1 - share) * found[first] + share * found[last]
+        return found
 
     @property
     def text(self) -> str:
@@ -39,7 +55,7 @@ def true_path(run: RunFolder) -> TruePath | None:
         return None
     rows = np.searchsorted(run.sequence.indices, np.array(run.source_index)[run.frame_indices])
     wanted = truth.camera_centers[np.minimum(rows, len(truth) - 1)]
-    centers = np.full_like(wanted, np.nan)
+    centers, length = np.full_like(wanted, np.nan), 0.0
     known = np.isfinite(wanted).all(axis=1)
     for segment in np.unique(trajectory.segment).tolist():
         here = np.flatnonzero((trajectory.segment == segment) & known)
@@ -47,9 +63,9 @@ def true_path(run: RunFolder) -> TruePath | None:
         if len(here) < _FEWEST or np.ptp(wanted[here], axis=0).max() == 0 or np.ptp(estimate, axis=0).max() == 0:
             continue
         centers[here] = align_points(estimate, wanted[here], with_scale=True).apply(wanted[here])
+        # from one known place to the next, also where there is no truth between them
+        length += float(np.linalg.norm(np.diff(centers[here], axis=0), axis=1).sum())
     errors = np.linalg.norm(trajectory.camera_centers - centers, axis=1)
-    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)[np.diff(trajectory.segment) == 0]
-    length = float(np.nansum(steps))
     if not np.isfinite(errors).any() or length == 0:
         return None
-    return TruePath(centers, errors, 100.0 * float(np.sqrt(np.nanmean(errors**2))) / length)
+    return TruePath(centers, errors, 100.0 * float(np.sqrt(np.nanmean(errors**2))) / length, trajectory.segment)

@@ -265,13 +265,17 @@ def _different(tried: list[Guess]) -> list[Guess]:
 
 def refuse_unsure(result: CameraFromMotion, name: str, settings: SelfCalibrationSettings) -> None:
     """Raises: InputError, in plain words, where the numbers would mislead."""
-    if result.focal_deviation > settings.max_focal_deviation:
+    if not np.isfinite([result.fov, *result.values.values()]).all():
+        raise InputError(
+            f"{name}: its motion does not tell its camera (the distortion found has no inverse); {_ADVICE}"
+        )
+    if not result.focal_deviation <= settings.max_focal_deviation:  # nor where it is NaN
         raise InputError(
             f"{name}: its motion leaves the focal length open: {result.camera.fx:.0f} px +- "
             f"{100 * result.focal_deviation:.1f} %, where {100 * settings.max_focal_deviation:.0f} % is the limit "
             f"(max_focal_deviation); {_ADVICE}"
         )
-    if result.rms > settings.max_rms:
+    if not result.rms <= settings.max_rms:
         raise InputError(
             f"{name}: no camera explains it: points miss their places by {result.rms:.1f} px; its zoom or focus "
             f"changes, or its pictures are stabilised; {_ADVICE}"

@@ -17,6 +17,9 @@ from improvo.sequences.sequence import Sequence
 from improvo.types import Features, Float64, UInt8
 
 _ANY_FOV = 60.0  # opens the recording without undistorting it; nothing else depends on it
+# Pixels by which a detector puts all its keypoints too far right and down: OpenCV's SIFT looks first at a picture of
+# twice the size, whose pixel centres it takes for those of every second pixel. The principal point would be as far off.
+_OFF = {"sift": 0.25}
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,7 @@ def piece_rows(times: Float64, frames: int, pieces: int, max_rate: float) -> lis
 def detect_pieces(
     sequence: Sequence, rows: list[range], frontend: Frontend, progress: Callable[[], object] = lambda: None
 ) -> list[Piece]:
-    """Features of pieces of a recording; frames that cannot be read are left out.
+    """Features of pieces of a recording, where the picture has them; frames that cannot be read are left out.
 
     Args:
         sequence: from `open_raw`.
@@ -99,7 +102,9 @@ def detect_pieces(
                 continue
             finally:
                 progress()
-            features.append(features_of(frontend, frame))
+            found_here = features_of(frontend, frame)
+            off = np.float32(_OFF.get(frontend.name, 0.0))
+            features.append(replace(found_here, keypoints=found_here.keypoints - off))
             times.append(frame.time)
         found.append(Piece(tuple(features), tuple(times)))
     return found

@@ -7,6 +7,12 @@ from typing import Any
 
 from improvo.errors import ConfigError
 
+_FROM_ZERO = (
+    *("furniture", "clutter", "posters", "walkers", "balls", "plain_share", "repeated_share", "gloss", "vignetting"),
+    *("speed", "turn", "hand_jitter", "walking_bob", "brightness", "noise", "exposure_time", "exposure_drift"),
+    "rolling_shutter",
+)
+
 
 @dataclass(frozen=True)
 class SimulationSettings:
@@ -37,9 +43,9 @@ class SimulationSettings:
 
     # the hand that holds the camera
     speed: float = 0.35  # metres per second along the path
-    turn: float = 25.0  # degrees per second, largest rate of looking around
-    hand_jitter: float = 1.0  # 1 is an ordinary hand: about 3 mm and 0.4 degrees
-    walking_bob: float = 0.012  # height of a step
+    turn: float = 25.0  # degrees per second from one look to the next, at most; half as much again on the way
+    hand_jitter: float = 1.0  # 1 is an ordinary hand: 3 mm along and 0.3 degrees about each axis, standard deviation
+    walking_bob: float = 0.012  # by which a step lifts and lowers the camera
 
     # light and sensor
     brightness: float = 1.0
@@ -52,14 +58,21 @@ class SimulationSettings:
     colour: bool = True  # False writes grey images
 
     def __post_init__(self) -> None:
-        least = {"frames": 2, "width": 64, "height": 48, "blur_samples": 1, "furniture": 0, "clutter": 0, "walkers": 0}
+        least = {"frames": 2, "width": 64, "height": 48, "blur_samples": 1, **dict.fromkeys(_FROM_ZERO, 0)}
         for name, minimum in least.items():
-            if getattr(self, name) < minimum:
+            if not getattr(self, name) >= minimum:
                 raise ConfigError(f"setting `{name}`: {getattr(self, name)} is too small; at least {minimum}")
         if not (self.fps > 0 and 20 <= self.fov <= 120):
             raise ConfigError(
                 f"settings `fps` {self.fps} and `fov` {self.fov}: fps above 0, fov from 20 to 120 degrees"
             )
+        for name in ("plain_share", "repeated_share", "gloss", "vignetting"):
+            if not getattr(self, name) <= 1:
+                raise ConfigError(f"setting `{name}`: {getattr(self, name)} is a share between 0 and 1")
+        if self.plain_share + self.repeated_share > 1:
+            raise ConfigError("settings `plain_share` and `repeated_share`: must not be more than 1 together")
+        if not 2.3 <= self.room_height <= 6:
+            raise ConfigError(f"setting `room_height`: {self.room_height} must lie between 2.3 and 6 metres")
         if not 3.5 <= min(self.room_size) <= max(self.room_size) <= 12:
             raise ConfigError(f"setting `room_size`: {self.room_size} must lie between 3.5 and 12 metres")
 

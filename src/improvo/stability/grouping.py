@@ -7,13 +7,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from improvo.errors import InputError
 from improvo.types import Float64, Int64
 
 
 def rows_of(ids: Int64, wanted: Int64) -> Int64:
-    """The row of `ids` (unique) that holds each wanted id."""
+    """The row of `ids` (unique) that holds each wanted id.
+
+    Raises:
+        InputError: none holds one of them.
+    """
     order = np.argsort(ids, kind="stable")
-    return order[np.searchsorted(ids, wanted, sorter=order)] if len(ids) else np.zeros(0, np.int64)
+    rows = np.append(order, -1)[np.searchsorted(ids, wanted, sorter=order)]
+    missing = np.flatnonzero((rows < 0) | (np.append(ids, -1)[rows] != wanted))
+    if len(missing):
+        raise InputError(f"track {wanted[missing[0]]} is in one table and not in the other; label the recording again")
+    return rows
 
 
 def medians(group: Int64, values: NDArray[Any], groups: int) -> Float64:

@@ -25,11 +25,16 @@ def as_text(name: str) -> str:
     return "".join("\N{REPLACEMENT CHARACTER}" if 0xD800 <= ord(each) <= 0xDFFF else each for each in name)
 
 
-def check_path(path: Path) -> Path:
+def check_path(path: Path, reachable: bool = False) -> Path:
     """The path, if the system can look it up; whether something is there does not matter.
 
+    Args:
+        path: of anything.
+        reachable: whether this process must be allowed to look it up; without that, Python raises what is not caught
+            whenever somebody asks if it is there.
+
     Raises:
-        InputError: it holds NUL, is too long, or is a loop of links.
+        InputError: it holds NUL, is too long, is a loop of links, or lies in a folder that may not be looked into.
     """
     try:
         os.stat(path)
@@ -39,4 +44,6 @@ def check_path(path: Path) -> Path:
         if error.errno in _REASONS:
             shown = str(path) if len(str(path)) <= 100 else f"{str(path)[:97]}..."
             raise InputError(f"{shown}: {_REASONS[error.errno]}; check the path") from None
+        if reachable and isinstance(error, PermissionError):
+            raise InputError(f"{path}: no permission to look into its folder; choose another, or change that") from None
     return path

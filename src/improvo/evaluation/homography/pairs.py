@@ -133,7 +133,7 @@ def _read_image(path: str, longest_side: int) -> tuple[UInt8, Float64]:
 
 def _read_homography(path: str) -> Float64:
     try:
-        matrix = np.array(Path(path).read_text().split(), np.float64).reshape(3, 3)
+        matrix = np.array(Path(path).read_text(encoding="utf-8").split(), np.float64).reshape(3, 3)
     except (OSError, UnicodeDecodeError, ValueError):
         raise InputError(f"{path}: must hold the nine numbers of a homography; mend the file") from None
     if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:

@@ -120,7 +120,7 @@ def write_cache(folder: Path, fingerprint: dict[str, Any], features: dict[int, F
                 if parts and all(part is not None for part in parts):
                     np.save(temporary / f"{name}.npy", np.concatenate(parts), allow_pickle=False)
             index = {"format": FORMAT, "fingerprint": fingerprint, "frames": frames, "ends": ends.tolist()}
-            (temporary / "index.json").write_text(json.dumps(index))
+            (temporary / "index.json").write_text(json.dumps(index), encoding="utf-8")
             if folder.exists():
                 shutil.rmtree(folder)
             temporary.rename(folder)

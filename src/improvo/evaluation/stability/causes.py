@@ -33,7 +33,8 @@ class TrueCauses:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         try:
-            self.codes: dict[str, int] = dict(load_json((folder / "simulation.json").read_text())["causes"])
+            text = (folder / "simulation.json").read_text(encoding="utf-8")
+            self.codes: dict[str, int] = dict(load_json(text)["causes"])
         except (OSError, ValueError, KeyError, TypeError):
             raise InputError(
                 f"{folder}: has no readable simulation.json; give a folder made by `improvo simulate`"

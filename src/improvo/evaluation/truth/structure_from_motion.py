@@ -272,7 +272,7 @@ def _match(
     pairing.match_list_path = folder / "pairs.txt"
     done = 0
     for chunk in _chunks(pairs, 8 * _CHUNK):
-        (folder / "pairs.txt").write_text("".join(f"{names[a]} {names[b]}\n" for a, b in chunk))
+        (folder / "pairs.txt").write_text("".join(f"{names[a]} {names[b]}\n" for a, b in chunk), encoding="utf-8")
         pycolmap.match_image_pairs(
             folder / "database.db", matching_options=options, pairing_options=pairing, device=pycolmap.Device.cpu
         )

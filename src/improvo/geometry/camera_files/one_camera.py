@@ -255,7 +255,10 @@ def _coefficients(values: dict[str, float], given: set[str], model: str) -> tupl
 
 
 def _read_out(keys: Keys, intrinsics: Four, size: tuple[int, int] | None) -> tuple[Four, tuple[int, int] | None]:
-    """ROS `roi` and `binning`: the part of the sensor that was read out, and the pixels that were joined."""
+    """ROS `roi` and `binning`: the part of the sensor that was read out, and the pixels that were joined.
+
+    Edges of joined pixels are edges of those that they join, as where a picture is resized.
+    """
     fx, fy, cx, cy = intrinsics
     x, y = keys.number("roixoffset", "xoffset") or 0.0, keys.number("roiyoffset", "yoffset") or 0.0
     width, height = keys.number("roiwidth") or 0.0, keys.number("roiheight") or 0.0
@@ -265,4 +268,5 @@ def _read_out(keys: Keys, intrinsics: Four, size: tuple[int, int] | None) -> tup
         size = _whole(width, height)
     if size is not None:
         size = (int(size[0] // join_x), int(size[1] // join_y))
-    return (fx / join_x, fy / join_y, (cx - x) / join_x, (cy - y) / join_y), size
+    centre = (cx - x + 0.5) / join_x - 0.5, (cy - y + 0.5) / join_y - 0.5
+    return (fx / join_x, fy / join_y, *centre), size

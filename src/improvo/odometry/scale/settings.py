@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from improvo.config import yaml_line
 from improvo.errors import ConfigError
 
 Source = Literal["none", "depth", "truth", "distance", "height", "marker"]
@@ -67,7 +68,9 @@ def scale_settings(given: Sequence[Sequence[str]]) -> list[str]:
         raise ConfigError("--scale: is given twice; only `distance` can be, for several known distances")
     found = [f"scale.source={source}"]
     if source == "truth":
-        return found + [f"scale.{name}={word!r}" for name, word in zip(("reference", "began"), rest, strict=False)]
+        return found + [
+            f"scale.{name}={yaml_line(word)}" for name, word in zip(("reference", "began"), rest, strict=False)
+        ]
     try:
         if source == "distance":
             triples = [f"[{int(first)}, {int(last)}, {float(metres)!r}]" for _, first, last, metres in given]

@@ -12,7 +12,7 @@
   let overlay = "tracks";
   let timer = 0;
   const points = data.frames.map((frame) => Uint8Array.from(atob(frame.points), (c) => c.charCodeAt(0)));
-  const ROW = 11; // u, v, previous u, previous v (uint16, in 1/16 px), age, error, label (uint8)
+  const ROW = 11; // u, v, previous u, previous v (uint16, in parts of a pixel), age, error, label (uint8)
 
   function colour(table, k) {
     return `rgb(${table[3 * k]},${table[3 * k + 1]},${table[3 * k + 2]})`;
@@ -22,7 +22,7 @@
     const rows = new DataView(bytes.buffer);
     const unit = canvas.width / data.width;
     for (let i = 0; i < bytes.length; i += ROW) {
-      const [u, v, pu, pv] = [0, 2, 4, 6].map((k) => (rows.getUint16(i + k, true) / 16 + 0.5) * unit);
+      const [u, v, pu, pv] = [0, 2, 4, 6].map((k) => (rows.getUint16(i + k, true) / data.parts + 0.5) * unit);
       const [age, error, label] = [bytes[i + 8], bytes[i + 9], bytes[i + 10]];
       if (overlay === "residuals" && error === 255) continue;
       const shade = overlay === "labels" ? colour(data.labels, label)

@@ -1,0 +1,81 @@
+"""What the benchmarks count: each number is of what its table says, and what cannot be told is not told."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.fixture
+def judge(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    pytest.importorskip("scipy")
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import judge
+
+    return judge
+
+
+def recording(folder: Path, name: str, poses: str = "poses") -> Any:
+    """A recording held back, as far as the shares that are kept depend on it."""
+    own = folder / name
+    own.mkdir(parents=True, exist_ok=True)
+    (own / "trajectory.txt").write_text(poses)
+    part = SimpleNamespace(name=name, labeled=SimpleNamespace(folder=own))
+    return SimpleNamespace(part=part, pairs={"judge 30": np.array([[0, 30]])})
+
+
+def test_kept_shares_are_of_one_recording_one_run_its_pairs_and_the_content_of_the_weights(
+    judge: ModuleType, tmp_path: Path
+) -> None:
+    for folder, content in (("a", b"one"), ("b", b"two")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "weights.safetensors").write_bytes(content)
+    first, second = (tmp_path / folder / "weights.safetensors" for folder in "ab")
+    kitchen = recording(tmp_path / "out" / "reference", "kitchen")
+    other_pairs = recording(tmp_path / "out" / "reference", "kitchen")
+    other_pairs.pairs["judge 60"] = np.array([[0, 60]])
+    others = [
+        judge.scores_file(tmp_path, recording(tmp_path / "out" / "reference", "office"), "new", first),
+        judge.scores_file(tmp_path, recording(tmp_path / "again" / "out" / "reference", "kitchen"), "new", first),
+        judge.scores_file(tmp_path, other_pairs, "new", first),
+        judge.scores_file(tmp_path, kitchen, "new", second),
+    ]
+    own = judge.scores_file(tmp_path, kitchen, "new", first)
+    assert len({own, *others}) == 5
+    assert judge.scores_file(tmp_path, kitchen, "new", first) == own
+    run_again = recording(tmp_path / "out" / "reference", "kitchen", "other poses")
+    assert judge.scores_file(tmp_path, run_again, "new", first) != own
+
+
+def test_one_pair_has_no_interval(judge: ModuleType) -> None:
+    before, after = {"judge 30": [[0.5]]}, {"judge 30": [[0.55]]}
+    assert judge._gain(before, after, ["judge 30"], 0) == "+10.0 % (too few pairs for an interval)"
+    many = {"judge 30": 10 * [[0.5]]}, {"judge 30": 10 * [[0.55]]}
+    assert judge._gain(*many, ["judge 30"], 0) == "+10.0 % (+10.0 to +10.0)"
+
+
+def test_nothing_compared_is_not_unchanged(tmp_path: Path) -> None:
+    same = {"label": {"tracks.parquet": {"sorted": "1"}}}
+    for name, content in (("a", same), ("b", same), ("none", {})):
+        (tmp_path / f"{name}.json").write_text(json.dumps(content))
+
+    def compared(first: str, second: str) -> subprocess.CompletedProcess[str]:
+        files = [str(tmp_path / f"{name}.json") for name in (first, second)]
+        command = [sys.executable, str(BENCHMARKS / "unchanged.py"), "--compare", *files]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    fine = compared("a", "b")
+    assert fine.returncode == 0
+    assert "1 of 1 tasks" in fine.stdout
+    assert "without results in either: " in fine.stdout
+    assert compared("none", "none").returncode == 1
+    assert compared("a", "none").returncode == 1
