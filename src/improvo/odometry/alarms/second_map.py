@@ -103,6 +103,8 @@ def explained_tracks(views: Sequence[View], poses: Poses, camera: Camera, tolera
         camera: pinhole.
         tolerance: pixels, in every view.
     """
+    if len(views) < _LEAST_VIEWS:
+        return 0
     worlds = [np.flatnonzero(~view.attached) for view in views]
     tracks = np.concatenate([view.tracks[rows] for view, rows in zip(views, worlds, strict=True)])
     keypoints = np.concatenate([view.detected[rows] for view, rows in zip(views, worlds, strict=True)])
