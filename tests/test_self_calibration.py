@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from simulated_features import World, hand_motion, room, wall
 
 from improvo.errors import InputError
+from improvo.frontend.registry import load_frontend
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.self_calibration.adjustment import Scene, adjusted
 from improvo.self_calibration.first_guess import agreement, far_pairs, guesses
 from improvo.self_calibration.from_motion import CameraFromMotion, LensFound, lens_of_pieces, refuse_unsure
 from improvo.self_calibration.lens import MODELS, NAMES, Lens, lens_of, lens_with_fov
-from improvo.self_calibration.raw_features import Piece, piece_rows
+from improvo.self_calibration.raw_features import Piece, detect_pieces, open_raw, piece_rows
 from improvo.self_calibration.settings import SelfCalibrationSettings
+from improvo.sequences.base import SequenceSettings
 from improvo.types import Features, Float64
 
 BROWN = Lens(np.array([420.0, 420.5, 330.0, 236.0, -0.28, 0.08]), "brown", 640, 480)
@@ -242,6 +246,28 @@ def test_a_camera_without_numbers_is_refused(change: dict[str, Any], said: str) 
     refuse_unsure(good, "walk", SETTINGS)
     with pytest.raises(InputError, match=said):
         refuse_unsure(replace(good, **change), "walk", SETTINGS)
+
+
+@pytest.mark.parametrize("name", ["sift", "akaze"])
+def test_keypoints_are_where_the_picture_has_them(name: str, tmp_path: Path) -> None:
+    """A principal point can be no better than they are; OpenCV's SIFT is a quarter of a pixel off by itself."""
+    rng = np.random.default_rng(0)
+    centres = np.stack(np.meshgrid(np.arange(40, 300, 50), np.arange(40, 220, 50)), axis=-1).reshape(-1, 2)
+    centres = centres + rng.uniform(0, 1, centres.shape)
+    y, x = np.mgrid[:240, :320]
+    picture = np.full((240, 320), 110.0)
+    for centre, size in zip(centres, rng.uniform(3, 7, len(centres)), strict=True):
+        picture += 100 * np.exp(-((x - centre[0]) ** 2 + (y - centre[1]) ** 2) / (2 * size**2))
+    assert cv2.imwrite(str(tmp_path / "0.png"), picture.astype(np.uint8))
+    assert cv2.imwrite(str(tmp_path / "1.png"), picture.astype(np.uint8))
+    sequence = open_raw(tmp_path, SequenceSettings())
+    (found,) = detect_pieces(sequence, [range(2)], load_frontend(name, 500))
+    off = found.features[0].keypoints[:, None] - centres
+    nearest = np.linalg.norm(off, axis=2).argmin(axis=0)
+    errors = off[nearest, np.arange(len(centres))]
+    errors = errors[np.linalg.norm(errors, axis=1) < 1]
+    assert len(errors) > 10
+    assert np.abs(np.median(errors, axis=0)).max() < 0.06
 
 
 def test_a_lens_that_folds_within_the_picture_has_no_field_of_view() -> None:

@@ -277,3 +277,25 @@ def test_a_stop_between_a_camera_and_its_figures_leaves_no_camera_of_another_rec
     assert (out / "camera.yaml").is_file()  # of the other recording
     find_cameras([walk], SequenceSettings(camera="auto"), out)
     assert asked == [walk, other, walk]
+
+
+def test_a_folder_that_holds_another_recording_by_now_is_looked_at_anew(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = counted(monkeypatch)
+    out, place = tmp_path / "out", tmp_path / "frames"
+    out.mkdir()
+    shutil.copytree(walk, place)
+    for _ in range(2):
+        find_cameras([place], SequenceSettings(camera="auto"), out)
+    assert asked == [place]
+    for picture in place.rglob("*.png"):
+        assert cv2.imwrite(str(picture), cv2.imread(str(picture))[:, ::-1])
+    find_cameras([place], SequenceSettings(camera="auto"), out)
+    assert asked == [place, place]
+    side = out / "camera.json"
+    content = json.loads(side.read_text())
+    del content["request"]["pictures"]  # as it was written before
+    side.write_text(json.dumps(content))
+    find_cameras([place], SequenceSettings(camera="auto"), out)
+    assert asked == [place, place]

@@ -498,6 +498,17 @@ def test_statistics_stay_where_they_are_fixed(tmp_path: Path) -> None:
         assert any(name.endswith("norm.weight") for name in moved)
 
 
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_whole_frames_train_above_frozen_layers_in_either_precision(tmp_path: Path, precision: str) -> None:
+    settings = replace(
+        SMALL, frozen_layers=4, pairs=replace(SMALL.pairs, whole_frames=1, group=1),
+        optimiser=replace(SMALL.optimiser, steps=3, precision=precision),
+    )  # fmt: skip
+    start = find_weights("superpoint-small")
+    row = train_held(Pictures((photographs(),)), [posed_room()], settings, tmp_path / "out", start, progress=False)
+    assert np.isfinite(row["loss"])
+
+
 @pytest.mark.parametrize("frozen", [4, 8])
 def test_frozen_layers_and_what_reads_only_them_stay_to_the_bit(tmp_path: Path, frozen: int) -> None:
     start = find_weights("superpoint-small")

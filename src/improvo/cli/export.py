@@ -103,7 +103,11 @@ def run_trajectory(arguments: argparse.Namespace) -> None:
 
     run_folder = RunFolder(arguments.folder)
     target = target_path(arguments.output, arguments.output, _FILE_NAMES[arguments.format], (".txt", ".csv"))
-    export_trajectory(run_folder.trajectory, run_folder.frames, target, arguments.format)
+    trajectory = run_folder.trajectory
+    export_trajectory(trajectory, run_folder.frames, target, arguments.format, run_folder.unit)
+    segments = len(set(trajectory.segment.tolist()))
+    if segments > 1 and arguments.format != "tum":
+        say(f"note: {segments} segments, each in a world of its own, stand in it without a mark; tum has marks")
     say(f"{target}: {len(run_folder.trajectory)} poses, camera-to-world, {run_folder.unit}")
     next_step(f"`improvo evaluate trajectory {typed(target)} TRUTH` measures them")
 

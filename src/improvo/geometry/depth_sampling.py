@@ -16,8 +16,8 @@ def depth_at(keypoints: Float32, depth: Float32, sampling: str = "bilinear", edg
     `bilinear` takes the four pixels around the keypoint, `nearest` the pixel under it and looks at its 3x3
     neighbourhood. Either way the point is dropped (NaN) if one of these pixels is a hole, or if they differ by more
     than `edge` of the smallest: there the keypoint lies on a depth discontinuity, and which side it belongs to is a
-    guess. A plane slanted by 80 degrees differs by 1.5 % (bilinear) or 3 % (nearest) in pictures 640 wide, by twice that
-    in pictures of half that width. Outside the image is NaN.
+    guess. A plane slanted by 80 degrees differs by 1.5 % (bilinear) or 3 % (nearest) in pictures 640 wide, by twice as
+    much in pictures of half that width. Outside the image is NaN.
 
     Args:
         keypoints: (N, 2) x, y in pixels of the depth map.

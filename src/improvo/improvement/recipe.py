@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from improvo.training.posed import PosedSequence
 
 _FEWEST = 300  # steps, however short the training part is
+_PART_WAY = "part-way"  # the stage that goes back towards the start
 _WEIGHTS = "weights.safetensors"
 
 
@@ -56,8 +57,9 @@ Train = Callable[[TrainingJob], dict[str, Any]]
 
 def stages(settings: ImproveSettings) -> tuple[str, ...]:
     """What a training does, one after the other, named as the recipes that do one of them alone."""
-    last = (METRIC,) if settings.recipe == HELD and settings.then_metric else ()
-    return (settings.recipe, *last)
+    if settings.recipe != HELD:
+        return (settings.recipe,)
+    return (HELD, *((METRIC,) if settings.then_metric else ()), *((_PART_WAY,) if settings.way < 1 else ()))
 
 
 def train(job: TrainingJob) -> dict[str, Any]:
@@ -68,7 +70,11 @@ def train(job: TrainingJob) -> dict[str, Any]:
     trains = {HELD: _train_held, METRIC: _train_metric, TRACKS: _train_tracks}
     row: dict[str, Any] = {}
     for number, stage in enumerate(stages(job.settings)):
-        row |= trains[stage](job.of_stage(number))
+        part = job.of_stage(number)
+        if stage == _PART_WAY:
+            _go_back(part, job.start)
+        else:
+            row |= trains[stage](part)
     return row
 
 
@@ -127,6 +133,13 @@ def _train_metric(job: TrainingJob) -> dict[str, Any]:
         weights = load_weights(job.start)
         save_weights(job.output / _WEIGHTS, weights.tensors, weights.card)
         return {}
+
+
+def _go_back(job: TrainingJob, start: Path) -> None:
+    from improvo.training.interpolated_weights import write_interpolated
+
+    job.output.mkdir(exist_ok=True)
+    write_interpolated(start, job.start, job.settings.way, job.output / _WEIGHTS)
 
 
 def _teaching(job: TrainingJob, longer_side: int) -> list[PosedSequence]:

@@ -13,7 +13,7 @@ from improvo.odometry.settings import OdometrySettings
 from improvo.sequences.base import SequenceSettings
 from improvo.stability.settings import LabelSettings
 from improvo.training.descriptor_metric import MetricSettings
-from improvo.training.held_settings import DevicePairSettings, HeldSettings
+from improvo.training.held_settings import DevicePairSettings, ElsewhereSettings, HeldSettings
 from improvo.training.settings import OdometryTrainingSettings, OptimiserSettings
 
 DEFAULT_START = "superpoint-small"  # on a CPU a step takes a quarter of the time of one of `superpoint`
@@ -104,12 +104,16 @@ class ImproveSettings:
             pairs=DevicePairSettings(
                 group=1, whole_frames=1, alone=250, keypoint_share=0.7, largest_gap=5.0, least_overlap=0.1
             ),
+            elsewhere=ElsewhereSettings(weight=1.0),
             optimiser=OptimiserSettings(  # 1200 steps take 4 minutes on a core with bfloat16
                 steps=1200, batch_size=2, learning_rate=1e-3, decay_steps=400, warmup_steps=50, workers=0
             ),
         )
     )
     then_metric: bool = True  # the recipe `held` ends with what `metric` does, on the descriptors that it has trained
+    # share of the way from the weights that a round starts from to those that the recipe `held` has trained from them,
+    # which is gone: with most of what was learned here goes less of what was known of other places
+    way: float = 0.8
     metric: MetricSettings = field(default_factory=MetricSettings)  # of the recipe `metric`, and of that
     training: OdometryTrainingSettings = field(  # of the recipe `tracks`
         default_factory=lambda: OdometryTrainingSettings(
@@ -124,6 +128,8 @@ class ImproveSettings:
         for name in ("minutes", "steps_per_frame"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ConfigError(f"{name}={getattr(self, name):g}: must be 0 or more")
+        if not 0 < self.way <= 1:
+            raise ConfigError(f"way={self.way:g}: must be above 0 and at most 1")
         if self.minutes and self.recipe != HELD:
             raise ConfigError("minutes: only the recipe `held` chooses its steps by time; give steps instead")
 

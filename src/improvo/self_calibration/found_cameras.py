@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -14,13 +15,14 @@ from improvo.files import write_json, write_text
 from improvo.odometry.run import RunSummary
 from improvo.self_calibration.from_motion import CameraFromMotion, Told, camera_from_motion
 from improvo.self_calibration.settings import SelfCalibrationSettings
-from improvo.sequences.base import SequenceSettings
+from improvo.sequences.base import Recording, SequenceSettings
 from improvo.sequences.opening import open_recording
 from improvo.sequences.rates import AUTO, recording_name
 from improvo.untrusted.text import read_json_file
 
 SINGLE, FOLDER = "camera.yaml", "cameras"
 _IRRELEVANT = ("camera", "fov", "undistorted_fov", "width")  # of how a recording is read
+_PICTURES = "pictures"
 Run = TypeVar("Run", bound=RunSummary)
 
 
@@ -111,7 +113,11 @@ def _find(
 
 def _is_of(camera: Path, request: dict[str, Any]) -> bool:
     side = camera.with_suffix(".json")
-    return camera.is_file() and side.is_file() and read_json_file(side, "delete it").get("request") == request
+    if not (camera.is_file() and side.is_file()):
+        return False
+    known = read_json_file(side, "delete it").get("request")
+    former = {name: value for name, value in request.items() if name != _PICTURES}  # was not written at first
+    return known in (request, former)
 
 
 def _request(path: Path, settings: SelfCalibrationSettings) -> dict[str, Any]:
@@ -122,4 +128,18 @@ def _request(path: Path, settings: SelfCalibrationSettings) -> dict[str, Any]:
     what = {"recording": str(path.absolute()), "frames": len(recording), "settings": how}
     if path.is_file():
         what |= {"bytes": path.stat().st_size}
+    elif len(recording):
+        what |= {_PICTURES: _digest(recording)}
     return dict(json.loads(json.dumps(what)))
+
+
+def _digest(recording: Recording) -> str:
+    """Of three pictures: a folder of the same name may hold another recording by now."""
+    digest = hashlib.blake2b(digest_size=16)
+    for index in sorted({0, len(recording) // 2, len(recording) - 1}):
+        try:
+            picture = recording.image(index)
+        except InputError:  # this frame is damaged
+            continue
+        digest.update(str(picture.shape).encode() + picture.tobytes())
+    return digest.hexdigest()

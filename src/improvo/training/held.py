@@ -65,10 +65,25 @@ class HeldStage(Stage):
                 stability = held_loss(stability_logits[:: settings.stability_every], batch["stability"])
                 total = total + settings.stability_weight * stability
                 result["stability"] = stability
+        if "elsewhere" in batch:
+            elsewhere = self._elsewhere(batch)
+            total, result["elsewhere"] = total + settings.elsewhere.weight * elsewhere, elsewhere
         with torch.no_grad():
             right = self._recognised(a, b, batch["valid"])
         correspondences = batch["valid"].sum(dim=1).float().mean()
         return {"loss": total, **result, "right": right, "scale": scale, "correspondences": correspondences}
+
+    def _elsewhere(self, batch: dict[str, Tensor]) -> Tensor:
+        """How far all heads are from what they are held to on pictures of other places; see `HeldElsewhere`."""
+        detector_logits, descriptors, stability_logits = self._heads(batch["elsewhere"])
+        with torch.autocast(descriptors.device.type, enabled=False):
+            own = sample_descriptors(descriptors.float(), batch["elsewhere_points"].float())
+            moved = ((own - batch["elsewhere_descriptors"].float()) ** 2).sum(dim=-1).mean()
+            if detector_logits is not None:
+                moved = moved + held_loss(detector_logits, batch["elsewhere_detector"])
+            if stability_logits is not None and "elsewhere_stability" in batch:
+                moved = moved + held_loss(stability_logits, batch["elsewhere_stability"])
+        return moved
 
     def _heads(self, seen: Tensor) -> tuple[Tensor | None, Tensor, Tensor | None]:
         """Of images, or of what the frozen layers make of them; None for heads that need not be held."""

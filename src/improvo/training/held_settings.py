@@ -64,6 +64,21 @@ class DevicePairSettings:
 
 
 @dataclass(frozen=True)
+class ElsewhereSettings:
+    """How descriptors and detector are held to the start's on bundled pictures of other places."""
+
+    # of the squared distance of descriptors at keypoints, and of the divergence from the detector; 0 shows none
+    weight: float = 0.0
+    pictures: int = 1  # a step
+    points: int = 300  # keypoints of a picture, at most, whose descriptors are held
+
+    def __post_init__(self) -> None:
+        checks = Checks(self, "elsewhere")
+        checks.at_least(0, "weight")
+        checks.at_least(1, "pictures", "points")
+
+
+@dataclass(frozen=True)
 class HeldSettings:
     """Descriptors trained on, while detector and stability are held to what other weights say of the same views."""
 
@@ -81,6 +96,7 @@ class HeldSettings:
     scale: float = 20.0  # inverse temperature of the descriptor loss at the start
     compile: bool = False  # let torch fuse the network's operations; needs a C compiler
     pairs: DevicePairSettings = field(default_factory=DevicePairSettings)
+    elsewhere: ElsewhereSettings = field(default_factory=ElsewhereSettings)
     optimiser: OptimiserSettings = field(
         default_factory=lambda: OptimiserSettings(
             batch_size=64, learning_rate=1e-3, steps=4000, decay_steps=1300, warmup_steps=100, workers=0

@@ -15,6 +15,7 @@ from improvo.frontend.channel_pruning import without_dead_channels
 from improvo.frontend.superpoint import SuperPoint
 from improvo.frontend.weights import DataSource, Weights, load_weights
 from improvo.training.device_pairs import DevicePairs
+from improvo.training.elsewhere import BUNDLED_SOURCE, HeldElsewhere, bundled_pictures
 from improvo.training.held import HeldStage
 from improvo.training.held_settings import HeldSettings
 from improvo.training.networks import started_network
@@ -60,9 +61,13 @@ def train_held(
         network_teacher(stability, "stability", device, precision) if stability else None, device,
     )  # fmt: skip
     batches = dense if dense.whole else _with_tracks(dense, labels, output)
+    if settings.elsewhere.weight:
+        batches = HeldElsewhere(batches, bundled_pictures(), parent, stability, settings, device, precision)
     if not data:
         names = (*(source.name for source in pictures.sources), *(sequence.name for sequence in posed))
         data = not_stated(names)
+    if settings.elsewhere.weight:
+        data = (*data, BUNDLED_SOURCE)
     published = replace(parent.architecture, stability=stability is not None)
     card = model_card(published, "held", settings, data, start)
     card.training.update(

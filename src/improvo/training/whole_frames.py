@@ -37,7 +37,10 @@ class WholeFrames:
     def batch(self, rows: Int64) -> dict[str, Tensor]:
         """`images` (V, 1, H, W) uint8 and what the teachers say of them, of frames (V,) of one size."""
         parts = [self._frame(int(row)) for row in rows]
-        return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        said = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        if "stem" in said and said["stem"].dtype == torch.float16:  # which the layers above do not read
+            said["stem"] = said["stem"].float()
+        return said
 
     def _frame(self, row: int) -> dict[str, Tensor]:
         if row in self._known:
