@@ -196,6 +196,18 @@ def test_an_exported_trajectory_says_its_unit_and_that_segments_have_no_marks(
         assert ("note: 2 segments" in capsys.readouterr().out) == noted
 
 
+def test_the_trajectory_of_a_run_is_not_replaced_by_its_export(
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Path(shutil.copytree(finished_run, tmp_path / "run"))
+    before = (run / "trajectory.txt").read_bytes()
+    for words in (["-o", str(run / "trajectory.txt"), "--format", "kitti"], ["-o", str(run)]):
+        assert main(["export", "trajectory", str(run), *words]) == 2
+        assert "trajectory.txt: is the run's own" in capsys.readouterr().err
+    assert (run / "trajectory.txt").read_bytes() == before
+    assert main(["export", "trajectory", str(run), "-o", str(run / "poses.txt"), "--format", "kitti"]) == 0
+
+
 def test_kitti_refuses_a_trajectory_with_gaps(tmp_path: Path) -> None:
     from improvo.errors import InputError
 

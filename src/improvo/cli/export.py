@@ -10,7 +10,7 @@ from improvo.cli.flags import add_setting
 from improvo.cli.output import figures, next_step, say, typed
 from improvo.cli.show_options import add_recording, add_run_folder, target_path
 from improvo.errors import ConfigError, OutputError
-from improvo.files import check_output_file
+from improvo.files import check_output_file, is_same_file
 
 if TYPE_CHECKING:
     from improvo.export.model import Model
@@ -103,6 +103,8 @@ def run_trajectory(arguments: argparse.Namespace) -> None:
 
     run_folder = RunFolder(arguments.folder)
     target = target_path(arguments.output, arguments.output, _FILE_NAMES[arguments.format], (".txt", ".csv"))
+    if is_same_file(target, arguments.folder / "trajectory.txt"):
+        raise OutputError(f"{target}: is the run's own, in the format tum already; choose another name")
     trajectory = run_folder.trajectory
     export_trajectory(trajectory, run_folder.frames, target, arguments.format, run_folder.unit)
     segments = len(set(trajectory.segment.tolist()))
