@@ -24,7 +24,7 @@ from robustness_clips import Clip
 
 RIGHT_PERCENT = 3.0  # of the segment's own path
 WRONG_PERCENT = 5.0
-RIGHT_ROTATION_DEG = 2.0  # over a second
+RIGHT_ROTATION_DEG = 2.0  # over a second, or over a whole segment that is shorter
 RIGHT_TURNS, WRONG_TURNS = 0.1, 0.5  # share of a segment's frames that turn otherwise, of a right and of a wrong one
 MIN_FRAMES = 20  # of a segment, for it to count
 MIN_PATH = 0.02  # metres; without a path, an error has no share of it
@@ -221,7 +221,10 @@ def _frames(clip: Clip, estimate: Trajectory, rotation_wrong: Mask, segments: li
 
 
 def _rotation_wrong(estimate: Trajectory, truth: Trajectory) -> Mask:
-    """(N,) frames whose turn within the second that begins with them, or ends, differs from the true one."""
+    """(N,) frames whose turn within the second that begins with them, or ends, differs from the true one.
+
+    A segment that is shorter than a second is judged by its turn from its first frame to its last.
+    """
     wrong_from, wrong_to = np.zeros(len(estimate), bool), np.zeros(len(estimate), bool)
     judged_from, judged_to = wrong_from.copy(), wrong_to.copy()
     usable = np.flatnonzero(estimate.valid & truth.valid[: len(estimate)])
@@ -237,6 +240,13 @@ def _rotation_wrong(estimate: Trajectory, truth: Trajectory) -> Mask:
         wrong = bool(rotation_angle_deg((true_turn.T @ turn)[None])[0] > RIGHT_ROTATION_DEG)
         wrong_from[row], judged_from[row] = wrong, True
         wrong_to[after], judged_to[after] = wrong, True
+    for number in np.unique(estimate.segment[usable]):
+        own = usable[estimate.segment[usable] == number]
+        if judged_from[own].any() or len(own) < 2:
+            continue
+        turn, true_turn = (_turn(each.world_from_cam, own[0], own[-1]) for each in (estimate, truth))
+        wrong_from[own] = rotation_angle_deg((true_turn.T @ turn)[None])[0] > RIGHT_ROTATION_DEG
+        judged_from[own] = True
     return (wrong_from | ~judged_from) & (wrong_to | ~judged_to) & (judged_from | judged_to)
 
 

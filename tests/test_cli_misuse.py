@@ -379,6 +379,19 @@ def test_a_trajectory_without_rotations_is_told(tmp_path: Path, capsys: pytest.C
 @pytest.mark.parametrize(
     ("words", "says"),
     [
+        (("info", "demo", "--samples", "0"), "samples=0: must be at least 1"),
+        (("info", "demo", "--samples", "-3", "--write-mask", "new.png"), "samples=-3: must be at least 1"),
+        (("evaluate", "vo", "demo", "--max-keypoints", "-1"), "max_keypoints=-1: odometry needs at least 50"),
+        (("evaluate", "homography", "--synthesize", "x", "--set", "homography.confidence=2"), "confidence=2.0: is a"),
+    ],
+)
+def test_numbers_out_of_range(words: tuple[str, ...], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert says in refused(words, capsys)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
         (("--seed", "-1"), "seed=-1: must be 0 or more, and less than 4294967296"),
         (("--seed", "99999999999999999999"), "must be 0 or more, and less than 4294967296"),
         (("--set", "odometry.tolerance=.inf"), "`odometry.tolerance`: inf is no finite number"),

@@ -227,6 +227,22 @@ def test_a_file_that_cannot_be_written_is_refused_before_any_work(
         check_output_file(tmp_path / "camera.yaml")
 
 
+@pytest.mark.parametrize(
+    "words",
+    [["calibrate", "demo", "-o", "package.yaml"], ["truth", "demo", "-o", "package.txt"]],
+)
+def test_what_is_written_beside_a_file_does_not_replace_what_is_of_others(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if words[0] == "truth":
+        pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'improvo[truth]'")
+    monkeypatch.chdir(tmp_path)
+    Path("package.json").write_text("{}")
+    assert main(words) == 2
+    assert "package.json: exists, and would be replaced, too" in capsys.readouterr().err
+    assert Path("package.json").read_text() == "{}"
+
+
 def test_calibrate_looks_at_its_output_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from improvo.cli.main import main
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -393,6 +394,26 @@ def test_bad_sequences_on_the_command_line_exit_2(
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert error.startswith("improvo: ")
     assert name in error
+
+
+def test_curves_of_solvers_that_are_not_asked_for_any_more_do_not_stay(tmp_path: Path) -> None:
+    """A page of the folder shows all of them."""
+    words = ["evaluate", "pose", "demo", "--gaps", "5", "--pairs", "2", "--frontend", "orb", "--workers", "1"]
+    words += ["--max-frames", "20", "-o", str(tmp_path / "out"), "--estimator"]
+    for solvers in (["opencv", "poselib"], ["poselib"]):
+        assert main([*words, *solvers]) == 0
+        curves = {path.name for path in (tmp_path / "out").glob("*.png")}
+        assert curves == {f"curves-{solver}.png" for solver in solvers}
+
+
+def test_two_recordings_of_one_name_are_not_mixed_by_an_export(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    places = [Path(shutil.copytree(bundled_sequence(), tmp_path / name / "room")) for name in ("a", "b")]
+    words = ["evaluate", "pose", *map(str, places), "--gaps", "5", "--pairs", "2", "--max-frames", "20"]
+    assert main([*words, "--export-images", str(tmp_path / "images")]) == 2
+    assert "`room` is given twice" in capsys.readouterr().err
+    assert not (tmp_path / "images").exists()
 
 
 def test_gaps_are_asked_in_seconds_or_by_overlap(tmp_path, capsys) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,18 @@ def test_hloc_reads_its_keypoints_descriptors_and_matches(walk: Path, tmp_path: 
     assert (model, int(width), int(height)) == ("PINHOLE", CAMERA.width, CAMERA.height)
     np.testing.assert_allclose([float(n) for n in numbers], [CAMERA.fx, CAMERA.fy, CAMERA.cx + 0.5, CAMERA.cy + 0.5])
     assert len(list((tmp_path / "out" / "images").iterdir())) == FRAMES
+
+
+def test_a_frame_that_is_left_out_is_said(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("h5py", reason="needs h5py: pip install 'improvo[hdf5]'")
+    damaged = Path(shutil.copytree(walk, tmp_path / "walk"))
+    (damaged / "000002.png").write_bytes(b"\x89PNG broken")
+    export(damaged, tmp_path / "out", "hloc", "--max-frames", "4")
+    said = capsys.readouterr().out
+    assert "3 images" in said
+    assert f"without 1 frame that could not be read, first {damaged / '000002.png'}: " in said
+    names = [line.split()[0] for line in (tmp_path / "out" / "intrinsics.txt").read_text().splitlines()]
+    assert names == ["000000.png", "000001.png", "000003.png"]
 
 
 def test_bits_are_unit_vectors_with_the_same_neighbours(walk: Path, tmp_path: Path) -> None:

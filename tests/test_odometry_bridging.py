@@ -6,14 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulated_features import CAMERA, error_percent, hand_motion, nothing_to_see, observe, room
+from simulated_features import CAMERA, World, error_percent, hand_motion, nothing_to_see, observe, room
 
+from improvo.geometry import se3
 from improvo.geometry.a_contrario import disc_probability, log10_false_alarms
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import BridgingSettings, OdometrySettings
 from improvo.odometry.states import TrackingState
 from improvo.odometry.visual_odometry import VisualOdometry
-from improvo.types import Features
+from improvo.types import Features, Float64, Mask
 
 TRUTH = hand_motion(150, step=0.03)
 GAP = 12  # frames; more than the odometry waits for
@@ -65,6 +66,28 @@ def test_another_place_is_another_segment() -> None:
     odometry = run([*features[: 50 + GAP], *other])
     assert len(odometry.segments) == 2
     assert odometry.segments[0].verdict.word == odometry.segments[1].verdict.word == "right"
+
+
+@pytest.mark.parametrize(("alike", "segments"), [(25, 2), (120, 1)])
+def test_a_place_that_looks_alike_in_a_few_points_is_another_segment(alike: int, segments: int) -> None:
+    features, frames = with_a_gap(back=40)
+    seen = np.flatnonzero(_in_picture(room(), TRUTH[frames[50 + GAP :]]))[:alike]
+    here, there = room(), room(9)
+    mixed = World(
+        np.concatenate([here.points[seen], there.points]), np.concatenate([here.descriptors[seen], there.descriptors])
+    )
+    elsewhere = [observe(mixed, TRUTH[f], seed=700 + i) for i, f in enumerate(frames[50 + GAP :])]
+    assert len(run([*features[: 50 + GAP], *elsewhere]).segments) == segments
+
+
+def _in_picture(world: World, world_from_cam: Float64) -> Mask:
+    """(P,) points of a world that all of these views (N, 4, 4) show."""
+    shown = np.ones(len(world.points), bool)
+    for pose in world_from_cam:
+        points_cam = se3.transform(se3.inverse(pose), world.points)
+        pixels = CAMERA.project(points_cam)
+        shown &= (points_cam[:, 2] > 0.1) & (pixels > 0).all(axis=1) & (pixels < (CAMERA.width, CAMERA.height)).all(1)
+    return shown
 
 
 def test_the_state_is_provisional_until_the_joined_map_is_confirmed() -> None:

@@ -58,12 +58,16 @@ class TestEvents:
         log.lost(5, inliers=3)
         log.contradicted(8, "the segment ends")
         log.segment_started(9, 1)
+        log.checked_again(12, "a logo", "has the same poses")
         assert [(event.frame_index, event.kind) for event in log.events] == [
             (1, "initialising"),
             (5, "lost"),
             (8, "contradiction"),
             (9, "segment"),
+            (12, "checked again"),
         ]
+        assert "a logo" in log.events[4].detail
+        assert "the same poses" in log.events[4].detail
         assert "3 points" in log.events[1].detail
         assert "the segment ends" in log.events[2].detail
 

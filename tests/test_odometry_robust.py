@@ -10,6 +10,7 @@ import pytest
 from simulated_features import CAMERA, error_percent, hand_motion, nothing_to_see, observe, room
 
 from improvo.odometry import robust
+from improvo.odometry.alarms.second_map import SecondOpinion
 from improvo.odometry.mapping.initial_pair import InitFailure
 from improvo.odometry.settings import BridgingSettings, OdometrySettings
 from improvo.odometry.states import TrackingState
@@ -51,15 +52,26 @@ def walk(frames: int, dark: tuple[int, ...] = ()) -> list[Features]:
     return [nothing_to_see(i) if i in dark else observe(world, pose, seed=i) for i, pose in enumerate(TRUTH[:frames])]
 
 
-def contradicts_at(monkeypatch: pytest.MonkeyPatch, *frame_indices: int) -> None:
-    """The two-view check speaks at these frames, once each, and at no others."""
+def contradicts_at(monkeypatch: pytest.MonkeyPatch, *frame_indices: int, stands: bool = False) -> None:
+    """The two-view check speaks at these frames, once each, and at no others.
+
+    Args:
+        monkeypatch: of the test.
+        frame_indices: at which it speaks.
+        stands: whether a second map is asked; else it speaks against the first one, too.
+    """
     left = set(frame_indices)
+    if not stands:
+        monkeypatch.setattr(SecondOpinion, "stands", lambda *_: False)
 
     class Check:
         ambiguous = False
         has_judged = True
 
         def __init__(self, *_: object) -> None:
+            pass
+
+        def start_over(self) -> None:
             pass
 
         def contradicts(self, view: View, earlier: Mapping[int, View]) -> bool:
@@ -118,6 +130,17 @@ def test_a_contradicted_provisional_map_starts_anew_over_all_its_frames(monkeypa
     assert error_percent(trajectory.camera_centers, TRUTH[:80, :3, 3]) < 1.0
     assert sorted(view.frame_index for view in run.final) == list(range(80))
     assert [event.kind for event in run.odometry.events if event.frame_index == 45] == ["contradiction"]
+
+
+@pytest.mark.parametrize("frame", [45, 75])
+def test_a_contradicted_map_that_a_second_one_agrees_with_stays(monkeypatch: pytest.MonkeyPatch, frame: int) -> None:
+    contradicts_at(monkeypatch, frame, stands=True)
+    run, usual = Run(walk(110)), Run(walk(110))  # the check speaks once only
+    np.testing.assert_array_equal(run.odometry.trajectory.world_from_cam, usual.odometry.trajectory.world_from_cam)
+    assert [event.kind for event in run.odometry.events if event.frame_index == frame] == ["checked again"]
+    (segment,) = run.odometry.segments
+    assert segment.verdict.word == "right"
+    assert any("a second map did not" in words for words in segment.verdict.evidence)
 
 
 def test_a_map_that_starts_anew_is_another_world_in_the_same_segment(monkeypatch: pytest.MonkeyPatch) -> None:

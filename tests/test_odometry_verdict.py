@@ -58,6 +58,8 @@ def test_each_kind_of_evidence_can_make_a_segment_doubtful() -> None:
     slightly = replace(GOOD, error_percent=np.full(6, 1.35))
     words = [judge(slightly, SETTINGS, (), ("contradicted",), times).word for times in (1, 2)]
     assert words == [RIGHT, DOUBTFUL]
+    told = judge(worse, SETTINGS, (), ("one map was contradicted",), 0)
+    assert (told.word, told.evidence[0]) == (RIGHT, "one map was contradicted")
     assert judge(None, SETTINGS).word == NOT_JUDGED
     assert judge(None, SETTINGS, ("two motions",)).word == DOUBTFUL
 

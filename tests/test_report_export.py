@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -169,10 +170,42 @@ def test_images_of_an_export_are_the_frames(finished_run: Path, tmp_path: Path) 
 def test_trajectory_files_are_read_back(finished_run: Path, tmp_path: Path, format: str) -> None:
     path = tmp_path / {"tum": "t.txt", "kitti": "k.txt", "euroc": "data.csv"}[format]
     assert main(["export", "trajectory", str(finished_run), "-o", str(path), "--format", format]) == 0
-    ours, read = RunFolder(finished_run).trajectory, read_trajectory(path, format)
+    ours, read = RunFolder(finished_run).trajectory, read_trajectory(path)  # the format is told by its content
     np.testing.assert_allclose(read.world_from_cam, ours.world_from_cam, atol=1e-8)
     if format != "kitti":
         np.testing.assert_allclose(read.times, ours.times, atol=1e-8)
+
+
+def test_an_exported_trajectory_says_its_unit_and_that_segments_have_no_marks(
+    finished_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished_run, run)
+    report = json.loads((run / "run.json").read_text())
+    known = {"scale": "metres, from depth images", "metric": {"segments": []}}
+    (run / "run.json").write_text(json.dumps({**report, **known}))
+    assert main(["export", "trajectory", str(run), "-o", str(tmp_path / "t.txt")]) == 0
+    assert (tmp_path / "t.txt").read_text().startswith("# camera-to-world, metres, from depth images: timestamp")
+    whole = RunFolder(run).trajectory
+    broken = replace(whole, segment=np.where(np.arange(len(whole)) < 3, 0, 1))
+    monkeypatch.setattr(RunFolder, "trajectory", broken)
+    capsys.readouterr()
+    for format, noted in (("kitti", True), ("euroc", True), ("tum", False)):
+        command = ["export", "trajectory", str(run), "-o", str(tmp_path / f"{format}.txt"), "--format", format]
+        assert main(command) == 0
+        assert ("note: 2 segments" in capsys.readouterr().out) == noted
+
+
+def test_the_trajectory_of_a_run_is_not_replaced_by_its_export(
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Path(shutil.copytree(finished_run, tmp_path / "run"))
+    before = (run / "trajectory.txt").read_bytes()
+    for words in (["-o", str(run / "trajectory.txt"), "--format", "kitti"], ["-o", str(run)]):
+        assert main(["export", "trajectory", str(run), *words]) == 2
+        assert "trajectory.txt: is the run's own" in capsys.readouterr().err
+    assert (run / "trajectory.txt").read_bytes() == before
+    assert main(["export", "trajectory", str(run), "-o", str(run / "poses.txt"), "--format", "kitti"]) == 0
 
 
 def test_kitti_refuses_a_trajectory_with_gaps(tmp_path: Path) -> None:
@@ -272,6 +305,8 @@ def test_segments_are_models_of_their_own_the_longest_first(
     assert "frame_000017.png" in images[0]
     assert "frame_000018.png" in images[1]
     assert not (tmp_path / "c" / "images").exists()
+    assert main(["export", "colmap", str(finished_run), "-o", str(tmp_path / "c"), "--no-images"]) == 0
+    assert [path.name for path in (tmp_path / "c" / "sparse").iterdir()] == ["0"]  # nothing of the first export
     capsys.readouterr()
     assert main(["export", "nerfstudio", str(run), "-o", str(tmp_path / "n")]) == 0
     assert "only the longest of 2 segments: 12 frames" in capsys.readouterr().out

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
+from improvo.report import match_picture
 from improvo.report.match_picture import carry, paint_matches
 from improvo.types import Features, UInt8
 
@@ -48,6 +51,17 @@ def test_right_matches_agree_and_wrong_ones_do_not(with_depth: bool) -> None:
     assert (carried.error[~right] > 3).sum() >= 5
     residual = np.linalg.norm(carried.predicted - b.keypoints[carried.matches[:, 1]], axis=1)
     np.testing.assert_allclose(residual, carried.error, atol=1e-9)
+
+
+def test_a_match_behind_the_second_camera_counts_as_a_wrong_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b, depth = pair()
+    matches = np.stack([np.arange(60)] * 2, axis=1)
+    ahead = se3.rigid(np.eye(3), np.array([0.0, 0.0, -2.1]))
+    estimate = SimpleNamespace(cam_from_world=ahead, inliers=np.ones(60, bool))
+    monkeypatch.setattr(match_picture, "with_robust_solver", lambda *others, **options: estimate)
+    carried = carry(a, b, matches, depth, CAMERA)
+    assert 0 < carried.behind < 60
+    assert carried.behind + len(carried.matches) == 60
 
 
 class Known:

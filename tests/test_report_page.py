@@ -251,6 +251,13 @@ def test_what_is_wrong_is_said_in_plain_words() -> None:
     assert "a.png: truncated" in words(report(input={"skipped": skipped, "notes": []}))
 
 
+def test_every_loss_is_told() -> None:
+    events = [{"kind": "lost", "frame_index": 10 * number, "detail": "too few points"} for number in range(1, 9)]
+    said = words(report(events=events))
+    assert "Lost at frame 50: too few points." in said
+    assert "Lost 3 times more, at frames 60, 70, 80." in said
+
+
 def test_ranges_are_short() -> None:
     assert ranges([1, 2, 3, 7, 9, 10]) == "1-3, 7, 9-10"
     assert ranges(list(range(0, 40, 2))).endswith("and 12 more stretches")

@@ -165,6 +165,27 @@ def test_video_keeps_its_colours(tmp_path: Path) -> None:
     np.testing.assert_allclose(frame.reshape(-1, 3).mean(axis=0), [0, 0, 220], atol=25)
 
 
+def test_a_frame_that_cannot_be_read_is_left_out_unless_it_was_asked_for(
+    finished_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    walk = Path(shutil.copytree(finished_run.parent / "walk", tmp_path / "walk"))
+    (walk / "000007.png").write_bytes(b"\x89PNG broken")
+    place, video = ["--sequence", str(walk)], tmp_path / "tracks.mp4"
+    assert main(["show", "tracks", str(finished_run), *place, "-o", str(video)]) == 0
+    assert "without 1 frame: " in capsys.readouterr().out
+    assert cv2.VideoCapture(str(video)).get(cv2.CAP_PROP_FRAME_COUNT) == 29
+    each = ["--each", "--frames", "all", "-o", str(tmp_path / "each")]
+    assert main(["show", "labels", str(finished_run), *place, *each]) == 0
+    names = {path.name for path in (tmp_path / "each" / "labels").iterdir()}
+    assert names == {f"labels_{number:06d}.png" for number in range(30) if number != 7}
+    capsys.readouterr()
+    for frames in ("5,7", "7,"):
+        words = ["--frames", frames, "-o", str(tmp_path / "some.png")]
+        assert main(["show", "tracks", str(finished_run), *place, *words]) == 2
+        assert "000007.png: " in capsys.readouterr().err
+    assert not (tmp_path / "some.png").exists()
+
+
 @pytest.mark.parametrize("fps", [0.5, 15.0, 24.0, 30.0, 60.0, 119.88])
 @pytest.mark.parametrize("suffix", [".gif", ".webp", ".mp4", ".webm"])
 def test_a_moving_picture_lasts_as_long_as_it_should(tmp_path: Path, suffix: str, fps: float, capfd: Any) -> None:

@@ -17,7 +17,14 @@ from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.self_calibration.adjustment import Scene, adjusted
 from improvo.self_calibration.first_guess import agreement, far_pairs, guesses
-from improvo.self_calibration.from_motion import CameraFromMotion, LensFound, lens_of_pieces, refuse_unsure
+from improvo.self_calibration.from_motion import (
+    CameraFromMotion,
+    LensFound,
+    _cost_beside,
+    _fit,
+    lens_of_pieces,
+    refuse_unsure,
+)
 from improvo.self_calibration.lens import MODELS, NAMES, Lens, lens_of, lens_with_fov
 from improvo.self_calibration.raw_features import Piece, detect_pieces, open_raw, piece_rows
 from improvo.self_calibration.settings import SelfCalibrationSettings
@@ -62,7 +69,7 @@ def observed(
     pixels = pixels[seen] + rng.normal(scale=noise, size=(int(seen.sum()), 2))
     world = np.zeros(len(poses), np.int64)
     whole = Scene(lens, poses, xyz, view[seen], point[seen], pixels, world, motion)
-    return whole.without(np.zeros(len(pixels), bool))
+    return whole.only(whole.kept(np.zeros(len(pixels), bool)))
 
 
 def disturbed(truth: Scene, lens: Lens, seed: int) -> Scene:
@@ -268,6 +275,21 @@ def test_keypoints_are_where_the_picture_has_them(name: str, tmp_path: Path) -> 
     errors = errors[np.linalg.norm(errors, axis=1) < 1]
     assert len(errors) > 10
     assert np.abs(np.median(errors, axis=0)).max() < 0.06
+
+
+def test_a_model_is_charged_for_what_it_leaves_out() -> None:
+    """Without the rim of the picture, a model that is wrong there looks as good as the right one."""
+    whole = scene(FISHEYE, 0)
+    wrong, right = (_fit(whole, FISHEYE.as_model(model)) for model in MODELS)
+    left_out = right.kept & ~wrong.kept
+    assert left_out.sum() > 10
+    middle = np.array([FISHEYE.width / 2, FISHEYE.height / 2])
+    radius = np.linalg.norm(whole.pixels - middle, axis=1)
+    assert np.median(radius[left_out]) > 1.3 * np.median(radius)
+    alone = wrong.adjusted.cost / wrong.kept.sum()
+    assert _cost_beside(wrong, right) > 1.02 * alone
+    assert _cost_beside(right, right) == pytest.approx(right.adjusted.cost / right.kept.sum())
+    assert _cost_beside(right, wrong) < 0.9 * _cost_beside(wrong, right)
 
 
 def test_a_lens_that_folds_within_the_picture_has_no_field_of_view() -> None:

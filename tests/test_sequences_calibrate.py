@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from improvo.calibration.board import Board, _black, parse_board
-from improvo.calibration.camera_fit import choose_views, find_views, fit_camera
+from improvo.calibration.board import Board, _black, homography_tilt, parse_board
+from improvo.calibration.camera_fit import View, choose_views, find_views, fit_camera
 from improvo.cli.main import main
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
@@ -279,3 +279,55 @@ def test_real_board(shared_data: Path, tmp_path: Path) -> None:
     ours = load_calibration(str(out)).camera(752, 480)
     for name in ("fx", "fy", "cx", "cy"):
         assert getattr(ours, name) == pytest.approx(getattr(published, name), rel=0.01)
+
+
+def seen_views(camera: Camera, seed: int, disturbed: bool) -> list[View]:
+    """Thirty views of a board, many at the rim of the picture, with 0.15 px of noise; every tenth may be spoilt."""
+    rng, board = np.random.default_rng(seed), Board(9, 6, 0.025)
+    corners = board.points.astype(np.float64)
+    views: list[View] = []
+    while len(views) < 30:
+        distance, off = rng.uniform(0.25, 0.6), np.radians(rng.uniform(0, 50 if rng.random() < 0.4 else 20))
+        around = rng.uniform(0, 2 * np.pi)
+        facing = so3_exp(np.array([-np.sin(around), np.cos(around), 0.0]) * off)
+        turned = (corners - corners.mean(axis=0)) @ (facing @ so3_exp(rng.uniform(-0.5, 0.5, 3))).T
+        in_camera = turned + distance * facing[:, 2]
+        if (in_camera[:, 2] < 0.05).any():
+            continue
+        rays = camera.distort(in_camera[:, :2] / in_camera[:, 2:])
+        pixels = rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        if (pixels < 4).any() or (pixels > (camera.width - 5, camera.height - 5)).any():
+            continue
+        pixels += rng.normal(0, 2.0 if disturbed and len(views) % 10 == 3 else 0.15, pixels.shape)
+        found = pixels.astype(np.float32)
+        pose = homography_tilt(board.points, found, (camera.width, camera.height))
+        views.append(View(str(len(views)), board.points, found, 1.0, pose))
+    return views
+
+
+@pytest.mark.parametrize(
+    ("fov", "seed", "disturbed"),
+    [
+        (120, 1, False),  # OpenCV's own start of the fisheye model fails
+        (120, 0, True),  # likewise without the views that stand out
+        (90, 2, False),  # to the simple model, it is the views at the rim that stand out
+        (90, 1, True),
+    ],
+)
+def test_a_fisheye_is_one_also_where_views_at_the_rim_make_it_hard(fov: int, seed: int, disturbed: bool) -> None:
+    focal = {90: 330.0, 120: 190.0}[fov]
+    camera = Camera(640, 480, focal, focal, 319.5, 239.5, (0.02, -0.005, 0.001, 0.0), "fisheye")
+    fit = fit_camera(seen_views(camera, seed, disturbed), (640, 480))
+    assert fit.model == "fisheye"
+    assert len(fit.views) == (27 if disturbed else 30)
+    assert fit.camera.fx == pytest.approx(focal, rel=0.01)
+    assert fit.rms == pytest.approx(0.15 * np.sqrt(2), rel=0.05)
+    assert set(fit.tried) == {"brown4", "brown5", "fisheye"}
+
+
+@pytest.mark.parametrize("disturbed", [False, True])
+def test_a_simple_lens_keeps_its_simple_model(disturbed: bool) -> None:
+    camera = Camera(640, 480, 420.0, 421.0, 322.0, 238.0, (-0.28, 0.08, 0.0002, 0.0001))
+    fit = fit_camera(seen_views(camera, 0, disturbed), (640, 480))
+    assert fit.model == "brown4"
+    assert fit.camera.fx == pytest.approx(420.0, rel=0.005)

@@ -198,12 +198,13 @@ def check_output_folder(path: Path, command: str) -> None:
         raise OutputError(f"{path}: no permission to write in {existing}; choose another output folder")
 
 
-def check_output_file(path: Path, suffixes: Collection[str] = ()) -> None:
+def check_output_file(path: Path, suffixes: Collection[str] = (), beside: str = "") -> None:
     """Refuse a file that cannot be written, before any work is done; clear what killed processes left beside it.
 
     Args:
         path: of the file.
         suffixes: of files of its kind, with their dots. What exists under another is not replaced.
+        beside: suffix of a second file that is written with it. One that is there without the first is another's.
 
     Raises:
         OutputError: it is a folder, lies in a file, has an impossible name, is of another kind, or there is no
@@ -214,14 +215,16 @@ def check_output_file(path: Path, suffixes: Collection[str] = ()) -> None:
         raise OutputError(f"{path}: is a folder; give the name of a file in it")
     if suffixes and path.exists() and path.suffix.lower() not in suffixes:
         raise OutputError(f"{path}: exists, and is no {' or '.join(suffixes)} file to be replaced; choose another name")
+    if beside and path.with_suffix(beside).exists() and not path.exists():
+        raise OutputError(f"{path.with_suffix(beside)}: exists, and would be replaced, too; choose another name")
     existing = next(parent for parent in path.absolute().parents if parent.exists())
     if not existing.is_dir():
         raise OutputError(f"{path}: {existing} is a file, not a folder; choose another folder")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise OutputError(f"{path}: no permission to write in {existing}; choose another folder")
     if path.parent.is_dir():
-        for beside in path.parent.glob(".*.partial*"):  # the folder is the user's, and may be large: nothing below it
-            _remove_leftover(beside)
+        for left in path.parent.glob(".*.partial*"):  # the folder is the user's, and may be large: nothing below it
+            _remove_leftover(left)
 
 
 def _check_name(path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ _CELLS = (8, 6)
 _SHARP = 0.75  # of the median sharpness
 _SIMPLER = 0.97  # a richer model must bring the error below this share of the simpler one's
 _OUTLIER = 3.0  # times the median error of the views
+_FISHEYE_STARTS = (90.0, 120.0, 150.0, 180.0)  # degrees
 _CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-9)
 
 
@@ -115,7 +117,7 @@ def fit_camera(views: list[View], size: tuple[int, int], model: str = "auto") ->
             "move it through the whole picture, into the corners too"
         )
     names = ("brown4", "brown5", "fisheye") if model == "auto" else (model,)
-    fits = {name: fit for name in names if (fit := _solve(views, size, name)) is not None}
+    fits = _solve(views, size, names)
     if not fits:
         raise InputError("no camera explains these views of the board; check the corner count of --board")
     simplest = next(iter(fits))
@@ -137,21 +139,28 @@ class _Solved:
     tilt: float  # degrees, of the view that is tilted most
 
 
-def _solve(views: list[View], size: tuple[int, int], model: str) -> _Solved | None:
-    """Calibrate twice: the second time without views whose error stands out."""
-    solved = _solve_once(views, size, model)
-    if solved is None:
-        return None
-    limit = max(_OUTLIER * float(np.median(solved.view_errors)), 0.1)
-    kept = [view for view, error in zip(views, solved.view_errors, strict=True) if error <= limit]
-    if MIN_VIEWS <= len(kept) < len(views):
-        return _solve_once(kept, size, model) or solved
-    return solved
+def _solve(views: list[View], size: tuple[int, int], names: tuple[str, ...]) -> dict[str, _Solved]:
+    """Calibrate by every model twice: the second time without views whose error stands out.
+
+    They stand out under the model that fits most views best, and are left out for all: a model that is too simple would
+    otherwise leave out the rim of the picture, which tells it from the right one.
+    """
+    fits = {name: fit for name in names if (fit := _solve_once(views, size, name)) is not None}
+    if not fits:
+        return fits
+    errors = min((fit.view_errors for fit in fits.values()), key=lambda each: float(np.median(each)))
+    limit = max(_OUTLIER * float(np.median(errors)), 0.1)
+    kept = [view for view, error in zip(views, errors, strict=True) if error <= limit]
+    if not MIN_VIEWS <= len(kept) < len(views):
+        return fits
+    again = {name: _solve_once(kept, size, name, fit.camera) for name, fit in fits.items()}
+    return {name: fit for name, fit in again.items() if fit is not None} or fits
 
 
-def _solve_once(views: list[View], size: tuple[int, int], model: str) -> _Solved | None:
+def _solve_once(views: list[View], size: tuple[int, int], model: str, before: Camera | None = None) -> _Solved | None:
+    """The camera of one model; `before` is that of nearly the same views."""
     if model == "fisheye":
-        return _solve_fisheye(views, size)
+        return _solve_fisheye(views, size, before)
     points, pixels = [view.points for view in views], [view.pixels for view in views]
     flags = {"brown4": cv2.CALIB_FIX_K3, "brown5": 0, "brown8": cv2.CALIB_RATIONAL_MODEL}[model]
     try:
@@ -169,18 +178,17 @@ def _solve_once(views: list[View], size: tuple[int, int], model: str) -> _Solved
     return _Solved(camera, float(rms), spread, tuple(views), errors.ravel(), _tilt(rotations))
 
 
-def _solve_fisheye(views: list[View], size: tuple[int, int]) -> _Solved | None:
+def _solve_fisheye(views: list[View], size: tuple[int, int], before: Camera | None) -> _Solved | None:
     points = [view.points.reshape(1, -1, 3).astype(np.float64) for view in views]
     pixels = [view.pixels.reshape(1, -1, 2).astype(np.float64) for view in views]
-    flags = _fisheye_flag("CALIB_RECOMPUTE_EXTRINSIC") | _fisheye_flag("CALIB_FIX_SKEW")
-    try:
-        rms, matrix, distortion, rotations, translations = cv2.fisheye.calibrate(
-            points, pixels, size, np.eye(3), np.zeros((4, 1)), flags=flags, criteria=_CRITERIA
-        )
-    except cv2.error:
+    found = None if before is not None else _calibrated_fisheye(points, pixels, size, None)
+    if found is None:  # OpenCV's own start fails on views at the rim
+        starts = [before] if before is not None else [_equidistant(fov, size) for fov in _FISHEYE_STARTS]
+        tried = [each for start in starts if (each := _calibrated_fisheye(points, pixels, size, start)) is not None]
+        found = min(tried, key=lambda each: each[0], default=None)
+    if found is None:
         return None
-    if not np.isfinite(matrix).all() or not np.isfinite(distortion).all():
-        return None
+    rms, matrix, distortion, rotations, translations = found
     errors, rows = [], []
     coefficients = np.concatenate([matrix[[0, 1, 0, 1], [0, 1, 2, 2]], distortion.ravel()])
     for p, q, rotation, translation in zip(points, pixels, rotations, translations, strict=True):
@@ -193,6 +201,28 @@ def _solve_fisheye(views: list[View], size: tuple[int, int]) -> _Solved | None:
         return None
     camera = _camera(size, matrix, tuple(float(value) for value in distortion.ravel()), "fisheye")
     return _Solved(camera, float(rms), deviations, tuple(views), np.array(errors), _tilt(rotations))
+
+
+def _calibrated_fisheye(
+    points: list[Float64], pixels: list[Float64], size: tuple[int, int], start: Camera | None
+) -> Any:
+    """RMS, K, coefficients, rotations and translations; None where OpenCV gives up."""
+    flags = _fisheye_flag("CALIB_RECOMPUTE_EXTRINSIC") | _fisheye_flag("CALIB_FIX_SKEW")
+    matrix, distortion = np.eye(3), np.zeros((4, 1))
+    if start is not None:
+        flags |= _fisheye_flag("CALIB_USE_INTRINSIC_GUESS")
+        matrix, distortion = start.K, np.reshape(start.distortion or (0.0,) * 4, (4, 1))
+    try:
+        found = cv2.fisheye.calibrate(points, pixels, size, matrix, distortion, flags=flags, criteria=_CRITERIA)
+    except cv2.error:
+        return None
+    return found if np.isfinite(found[0]) and np.isfinite(found[1]).all() and np.isfinite(found[2]).all() else None
+
+
+def _equidistant(fov: float, size: tuple[int, int]) -> Camera:
+    """A fisheye without coefficients that sees so many degrees across."""
+    focal = size[0] / np.radians(fov)
+    return Camera(*size, focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2, (), "fisheye")
 
 
 def _fisheye_flag(name: str) -> int:

@@ -85,8 +85,9 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.recording is None:
         raise ConfigError("give a video, or --print-board FILE.pdf to make a board for one")
     settings = settings_from(SelfCalibrationSettings, arguments)
-    check_output_file(arguments.output, (".yaml", ".yml"))
-    if arguments.source == "board" or (arguments.source is None and arguments.board is not None):
+    of_a_board = arguments.source == "board" or (arguments.source is None and arguments.board is not None)
+    check_output_file(arguments.output, (".yaml", ".yml"), "" if of_a_board else ".json")
+    if of_a_board:
         _from_board(arguments, settings)
     else:
         _from_motion(arguments, settings)

@@ -177,6 +177,8 @@ def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         "request": request,
     }
     if output is not None:
+        for curves in output.glob("curves-*.png"):  # of an earlier evaluation, by other solvers
+            curves.unlink()
         write_records(run, output / "pairs.parquet")
         write_json(output / "pose.json", found)
         _write_text(found, output)

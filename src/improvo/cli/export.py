@@ -10,7 +10,7 @@ from improvo.cli.flags import add_setting
 from improvo.cli.output import figures, next_step, say, typed
 from improvo.cli.show_options import add_recording, add_run_folder, target_path
 from improvo.errors import ConfigError, OutputError
-from improvo.files import check_output_file
+from improvo.files import check_output_file, is_same_file
 
 if TYPE_CHECKING:
     from improvo.export.model import Model
@@ -39,6 +39,7 @@ def run_colmap(arguments: argparse.Namespace) -> None:
     segments = segments_by_length(run_folder)
     models = [segment_model(run_folder, each, arguments.max_error, arguments.min_observations) for each in segments]
     make_output_folder(arguments.output, "export colmap")
+    _clear_models(arguments.output / "sparse")
     written = []
     for number, model in enumerate(models):
         colours = None if arguments.no_images else _write_images(run_folder, model, arguments.output / "images")
@@ -102,7 +103,13 @@ def run_trajectory(arguments: argparse.Namespace) -> None:
 
     run_folder = RunFolder(arguments.folder)
     target = target_path(arguments.output, arguments.output, _FILE_NAMES[arguments.format], (".txt", ".csv"))
-    export_trajectory(run_folder.trajectory, run_folder.frames, target, arguments.format)
+    if is_same_file(target, arguments.folder / "trajectory.txt"):
+        raise OutputError(f"{target}: is the run's own, in the format tum already; choose another name")
+    trajectory = run_folder.trajectory
+    export_trajectory(trajectory, run_folder.frames, target, arguments.format, run_folder.unit)
+    segments = len(set(trajectory.segment.tolist()))
+    if segments > 1 and arguments.format != "tum":
+        say(f"note: {segments} segments, each in a world of its own, stand in it without a mark; tum has marks")
     say(f"{target}: {len(run_folder.trajectory)} poses, camera-to-world, {run_folder.unit}")
     next_step(f"`improvo evaluate trajectory {typed(target)} TRUTH` measures them")
 
@@ -154,6 +161,15 @@ def _add_model_arguments(parser: argparse.ArgumentParser, contents: str) -> None
     parser.add_argument("--max-error", type=float, default=4.0, metavar="PIXELS", help="drop observations beyond this")
     parser.add_argument("--min-observations", type=int, default=3, metavar="N", help="drop points with fewer")
     add_recording(parser)
+
+
+def _clear_models(folder: Path) -> None:
+    """Remove the models of an earlier export, which may have had more segments."""
+    import shutil
+
+    for model in folder.glob("*"):
+        if model.name.isdecimal() and not model.is_symlink():
+            shutil.rmtree(model, ignore_errors=True)
 
 
 def _check_model_arguments(arguments: argparse.Namespace) -> None:

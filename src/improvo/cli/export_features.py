@@ -19,7 +19,7 @@ from improvo.cli.options import (
     recording_path,
     settings_from,
 )
-from improvo.cli.output import figures, next_step, typed
+from improvo.cli.output import figures, next_step, say, typed
 from improvo.export.settings import FeatureExportSettings
 
 _LAYOUTS = ("hloc", "colmap")
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     from improvo.files import check_output_folder, make_output_folder
     from improvo.frontend.registry import frontend_from
     from improvo.sequences import open_sequence
-    from improvo.terminal import progress
+    from improvo.terminal import counted, progress
 
     folder: Path = arguments.output
     check_output_folder(folder, "export features")
@@ -77,6 +77,10 @@ def run(arguments: argparse.Namespace) -> int:
         f"{folder}: {written.images} images, {written.keypoints} keypoints, {written.pairs} "
         f"{'pairs' if for_hloc else 'verified pairs'}, {written.matches} matches",
     )
+    if sequence.skipped:
+        first = sequence.skipped[0]
+        left_out = counted(len(sequence.skipped), "frame")
+        say(f"without {left_out} that could not be read, first {first.source}: {first.reason}")
     if for_hloc:
         camera = sequence.camera
         numbers = f"{camera.fx},{camera.fy},{camera.cx + 0.5},{camera.cy + 0.5}"

@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> None:
         check_output_file(arguments.write_mask, sorted(IMAGE_SUFFIXES))
     settings = with_found_camera(settings_from(InfoSettings, arguments), [arguments.sequence], None, "info")
     with progress("info", "pair") as shown:
-        findings = survey(arguments.sequence, settings.sequence, max(1, settings.samples), shown.advance).to_dict()
+        findings = survey(arguments.sequence, settings.sequence, settings.samples, shown.advance).to_dict()
     lines = [f"{name:<14} {text}" for name, text in _lines(findings)]
     lines += [f"! {problem['what']}\n  -> {problem['advice']}" for problem in findings["problems"]]
     if not findings["problems"]:

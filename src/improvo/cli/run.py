@@ -36,7 +36,13 @@ if TYPE_CHECKING:
 
 NO_RESULT = 3  # exit status where everything was read, and no frame has a pose
 _WARNINGS = 5  # printed; run.json has them all
-_UNSAID = ("initialising", "segment", "doubtful", "uncertain")  # kinds of events that other lines say
+_UNSAID = (
+    "initialising",
+    "segment",
+    "doubtful",
+    "uncertain",
+    "checked again",
+)  # events that other lines say, or no alarm
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -169,21 +169,33 @@ def write_pictures(
     from improvo.terminal import progress
 
     name = arguments.part
+    unreadable: list[InputError] = []
     with progress(name, "frame", len(frames), shown=len(frames) >= _MANY) as shown:
 
-        def painted(frame: int) -> UInt8:
-            shown.advance()
-            return paint(frame)
+        def painted() -> Iterator[tuple[int, UInt8]]:
+            for frame in frames:
+                shown.advance()
+                try:
+                    picture = paint(frame)
+                except InputError as error:
+                    unreadable.append(error)
+                    if "," in arguments.frames or len(unreadable) == len(frames):  # asked for, or none is left
+                        raise
+                    continue
+                yield frame, picture
 
-        pictures = map(painted, frames)
+        numbered = painted()
+        pictures = (picture for _, picture in numbered)
         if _is_video(arguments):
             target = target_path(arguments.output, default_folder, f"{name}.mp4")
             write_video(target, pictures, arguments.video_fps or fps, arguments.video_width)
         elif arguments.each or len(frames) > _LARGEST_SHEET:
             target = target_path(arguments.output, default_folder, name)
-            for frame, picture in zip(frames, pictures, strict=True):
+            for frame, picture in numbered:
                 write_png(target / f"{name}_{frame:06d}.png", picture)
         else:
             target = target_path(arguments.output, default_folder, f"{name}.png")
             write_sheet(target, list(pictures))
+    if unreadable:
+        say(f"without {counted(len(unreadable), 'frame')}: {unreadable[0]}")
     say(str(target))

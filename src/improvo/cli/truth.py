@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     settings = settings_from(TruthCommandSettings, arguments, _FLAGS)
     load_pycolmap()  # said before any work
-    check_output_file(arguments.output, (".txt",))
+    check_output_file(arguments.output, (".txt",), ".json")
     settings = with_found_camera(settings, [arguments.sequence], None, "truth")
     sequence = open_sequence(arguments.sequence, settings.sequence)
     with terminal.stages("step") as told:

@@ -121,7 +121,8 @@ def run_calibrate(arguments: argparse.Namespace) -> None:
         raise InputError("calibrate: --count must be at least 1, and --quantile in (0, 1]")
     weights = load_weights(find_weights(arguments.weights))
     paths = [path for place in arguments.images for path in _pictures(place)]
-    paths = paths[:: max(1, -(-len(paths) // arguments.count))]
+    count = min(arguments.count, len(paths))
+    paths = [paths[number * len(paths) // count] for number in range(count)]
     unreadable: list[Path] = []
 
     def readable() -> Iterator[UInt8]:

@@ -114,6 +114,8 @@ class HomographySettings:
             raise ConfigError("max_keypoints must be 4 or more, longest_side 32 or more, views and resamples 1 or more")
         if not self.corner_errors_px or min(*self.corner_errors_px, self.max_error_px, self.ransac_px) <= 0:
             raise ConfigError("thresholds must be positive pixels")
+        if not 0 < self.confidence < 1:
+            raise ConfigError(f"confidence={self.confidence}: is a share between 0 and 1, such as 0.95")
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,10 @@ class VoCommandSettings:
     max_keypoints: int = 1000
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     trajectory: TrajectorySettings = field(default_factory=TrajectorySettings)
+
+    def __post_init__(self) -> None:
+        if self.max_keypoints < 50:
+            raise ConfigError(f"max_keypoints={self.max_keypoints}: odometry needs at least 50; 1000 is a good start")
 
 
 @dataclass(frozen=True)

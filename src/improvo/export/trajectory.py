@@ -20,7 +20,7 @@ _EUROC_HEADER = (
 )
 
 
-def export_trajectory(trajectory: Trajectory, frames: int, path: Path, format: str) -> None:
+def export_trajectory(trajectory: Trajectory, frames: int, path: Path, format: str, unit: str = "up to scale") -> None:
     """Write camera-to-world poses. Lengths are those of the run, which may be up to scale though a header says metres.
 
     Args:
@@ -28,6 +28,7 @@ def export_trajectory(trajectory: Trajectory, frames: int, path: Path, format: s
         frames: of the processed sequence; KITTI's format has no times and so cannot leave frames out.
         path: the file.
         format: one of FORMATS.
+        unit: of lengths, for the first line of a TUM file.
 
     Raises:
         InputError: KITTI's format, and some frames have no pose.
@@ -38,7 +39,7 @@ def export_trajectory(trajectory: Trajectory, frames: int, path: Path, format: s
     if format == "euroc":
         write_text(path, _euroc_text(trajectory))
     else:
-        write_trajectory(path, trajectory, format)
+        write_trajectory(path, trajectory, format, unit)
 
 
 def _euroc_text(trajectory: Trajectory) -> str:

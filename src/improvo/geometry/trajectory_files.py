@@ -27,6 +27,7 @@ RIGID_TOLERANCE = 1e-2
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")
 _TUM_HEADER = "# camera-to-world, {}: timestamp tx ty tz qx qy qz qw\n"
+_EUROC_NAMES = re.compile(r"^#?\s*timestamp\s*\[ns\]", re.IGNORECASE)
 _SEGMENT_COMMENT = re.compile(r"#\s*segment\s+(\d+)\s*(?::|$)")
 
 
@@ -219,15 +220,18 @@ def split_numbers(text: str) -> list[str]:
 
 
 def _guess(lines: list[str], path: Path) -> str:
+    named = False
     for line in lines:
         text = line.strip()
         fields = split_numbers(text)
         if not fields or text.startswith("#") or not is_number(fields[0]):
+            named |= _EUROC_NAMES.search(text) is not None
             continue
         if len(fields) == 12:
             return "kitti"
-        # EuRoC: nanoseconds, commas, and further columns after the quaternion
-        if len(fields) >= 8 and "," in text and re.fullmatch(r"\d{15,}", fields[0]):
+        # EuRoC: nanoseconds (since 1970, or as the names of the columns say), commas, and columns after the quaternion
+        nanoseconds = re.fullmatch(r"\d+" if named else r"\d{15,}", fields[0])
+        if len(fields) >= 8 and "," in text and nanoseconds:
             return "euroc"
         if len(fields) == 8:
             return "tum"

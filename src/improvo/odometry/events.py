@@ -17,8 +17,8 @@ class Event:
     """Something the user should know about a frame."""
 
     frame_index: int
-    # "initialising", "segment", "lost", "contradiction", "bridged", "uncertain", "doubtful", "attached", "two motions"
-    # or "focal length"
+    # "initialising", "segment", "lost", "contradiction", "checked again", "bridged", "uncertain", "doubtful",
+    # "attached", "two motions" or "focal length"
     kind: str
     detail: str
 
@@ -52,6 +52,10 @@ class EventLog:
     def contradicted(self, frame_index: int, consequence: str, by: str = "two-view geometry") -> None:
         """Something says that the map is wrong."""
         self._add(frame_index, "contradiction", f"{by} contradicts the map; {consequence}")
+
+    def checked_again(self, frame_index: int, by: str, found: str) -> None:
+        """Something spoke against the map, and a map started anew over the same frames did not."""
+        self._add(frame_index, "checked again", f"{by} spoke against the map; a map started anew {found}")
 
     def focal_length(self, frame_index: int, factor: float, consequence: str) -> None:
         """The lens is not what the camera says."""

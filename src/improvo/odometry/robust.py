@@ -6,6 +6,7 @@ from improvo.geometry.camera import Camera
 from improvo.odometry.alarms.attached import AttachedDetector
 from improvo.odometry.alarms.focal_change import LensWatch
 from improvo.odometry.alarms.health import HealthCheck
+from improvo.odometry.alarms.second_map import SecondOpinion
 from improvo.odometry.events import EventLog
 from improvo.odometry.gates import MEMORY_FRAMES, gate
 from improvo.odometry.mapper import Mapper
@@ -26,7 +27,7 @@ from improvo.types import Float64
 _CARRIED = 0.2  # share of the observations that turned out to move with the camera; with more the map is wrong
 _MAX_BUFFERED = 300  # frames in the initialisation buffer; the oldest leaves it without a pose
 _LOST = "lost"  # why a segment ended
-_TWO_VIEWS = "two-view geometry"  # what contradicted it
+_TWO_VIEWS, _ATTACHED = "two-view geometry", "what moves with the camera"  # what contradicted it
 
 
 class RobustMapper(Mapper):
@@ -49,6 +50,7 @@ class RobustMapper(Mapper):
         self._lens = LensWatch(camera, settings.tolerance, settings.seed)
         self._contradicted = 0  # maps in a row by two-view geometry, each over frames of the one before
         self._carried = False  # a large part of the map has turned out to move with the camera
+        self._second_opinion = SecondOpinion(camera, settings, descriptor_distance, events)
         self._window = SlidingWindow(settings.window, camera.width)
         self._health = HealthCheck(camera, settings, descriptor_distance)
         self._judge = SegmentJudge(camera, settings)
@@ -91,9 +93,10 @@ class RobustMapper(Mapper):
         self._map.remember(view)
         self._result.add_window(report)
         if self._carried:
-            self._start_anew(view, "what moves with the camera")
+            self._start_anew(view, _ATTACHED)
             return
-        if self._health.contradicts(view, {earlier.frame_index: earlier for earlier in self._map.history}):
+        history = {earlier.frame_index: earlier for earlier in self._map.history}
+        if self._health.contradicts(view, history) and not self._stands(list(history.values())):
             self._start_anew(view, _TWO_VIEWS)
             return
         if self._health.ambiguous:
@@ -105,6 +108,7 @@ class RobustMapper(Mapper):
 
     def finish(self) -> None:
         """The sequence is over: everything is final."""
+        self._second_opinion.on_dropped([])
         if self._map is not None:
             self._end_segment("end of the sequence")
         self._result.give_up(self._buffer)
@@ -144,7 +148,10 @@ class RobustMapper(Mapper):
             self._judge.alarm(f"the focal length is about {self._lens.factor:.2f} times that of the camera as given")
         if self._contradicted:
             maps = "a former map" if self._contradicted == 1 else f"each of {self._contradicted} former maps"
-            self._judge.suspicion(f"{maps} of these frames was contradicted by {_TWO_VIEWS}", self._contradicted)
+            words = f"{maps} of these frames was contradicted by {_TWO_VIEWS}"
+            # one was worse than the map that followed; several in a row tell that these frames mislead
+            self._judge.suspicion(words, self._contradicted if self._contradicted > 1 else 0)
+        self._second_opinion.on_dropped(self._buffer)
         self._result.begin_segment()
         self._result.give_up(each for each in self._buffer if each.cam_from_world is None)
         self._health = HealthCheck(self._camera, self._settings, self._descriptor_distance)
@@ -204,11 +211,23 @@ class RobustMapper(Mapper):
         self._events.attached(view.frame_index, float(view.attached.mean()) if len(view) else 0.0)
         return self._attached.drop(views)
 
+    def _stands(self, history: list[View]) -> bool:
+        """Whether a map that two views contradict stays, since a second one explains the tracks no better."""
+        views = self._provisional if self._states.is_provisional else history[-2 * self._settings.window.recent :]
+        if not self._second_opinion.stands(views, _TWO_VIEWS):
+            return False
+        self._judge.suspicion(f"{_TWO_VIEWS} spoke against the map, and a second map did not")
+        self._health.start_over()
+        return True
+
     def _start_anew(self, view: View, by: str) -> None:
         """The map is wrong: a provisional one starts anew over all its frames, another one over its last frames."""
         contradicted = self._contradicted + (by == _TWO_VIEWS)
         if self._states.is_provisional:
-            self._events.contradicted(view.frame_index, "the map is started anew", by)
+            if by == _TWO_VIEWS:
+                self._events.contradicted(view.frame_index, "the map is started anew", by)
+            else:
+                self._second_opinion.drop(self._provisional, by)
             self._buffer = self._provisional
             self._clear()
             self._states.map_ended()

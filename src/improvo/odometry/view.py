@@ -55,6 +55,20 @@ class View:
         self.keypoints[:], self.refined[:] = self.detected, False
         self.keyframe, self.non_keyframes = False, []
 
+    def unposed(self) -> View:
+        """Another view of the same frame, as it was before it had a pose."""
+        return View(
+            frame_index=self.frame_index,
+            time=self.time,
+            keypoints=self.detected.copy(),
+            descriptors=self.descriptors,
+            weights=self.weights,
+            tracks=self.tracks,
+            points=np.full(len(self.points), NO_POINT),
+            attached=self.attached.copy(),
+            image=self.image,
+        )
+
     def __len__(self) -> int:
         return len(self.keypoints)
 

@@ -31,6 +31,7 @@ class Carried:
     error: Float64  # (K,) pixels
     inliers: int  # of the pose estimate; 0 where there is none
     how: str  # for the caption
+    behind: int = 0  # matches more, whose point of A is behind B
 
 
 def paint_matches(
@@ -69,7 +70,10 @@ def paint_matches(
         [
             captioned(panel_a.rgb, f"{Path(frontend.name).name}: {len(a)} points in A"),
             captioned(panel_b.rgb, f"{len(b)} points in B, {len(matches)} matches"),
-            captioned(panel_c.rgb, f"{int(good.sum())} of {len(good)} within {_GOOD_ERROR:g} px; {carried.how}"),
+            captioned(
+                panel_c.rgb,
+                f"{int(good.sum())} of {len(good) + carried.behind} within {_GOOD_ERROR:g} px; {carried.how}",
+            ),
         ],
         columns=3,
     )
@@ -91,7 +95,7 @@ def carry(a: Features, b: Features, matches: Int64, depth_a: Float32 | None, cam
     predicted = camera.project(points_b[front])
     inliers = int(estimate.inliers.sum())
     error = np.linalg.norm(predicted - pixels[front], axis=1)
-    return Carried(known[front], predicted, error, inliers, f"pose by PnP, {inliers} inliers")
+    return Carried(known[front], predicted, error, inliers, f"pose by PnP, {inliers} inliers", int((~front).sum()))
 
 
 def _carry_along_epipolar_lines(a: Features, b: Features, matches: Int64, camera: Camera) -> Carried:

@@ -14,6 +14,7 @@ LABEL_WORDS = (
     "Ignore: too short, or in between stable and unstable, so it teaches nothing. Withheld: it had a label, which the "
     "quality gate took away, because the odometry is not to be trusted where the track was seen."
 )
+_TOLD = 5  # events of a kind that have a line of their own
 _DARK = 25.0  # mean grey value below which keypoints become rare
 
 
@@ -67,7 +68,11 @@ def _events(report: dict[str, Any]) -> list[str]:
     for event in report["events"]:
         by_kind.setdefault(event["kind"], []).append(event)
     for kind, word in (("lost", "Lost"), ("contradiction", "Doubtful")):
-        lines += [f"{word} at frame {event['frame_index']}: {event['detail']}." for event in by_kind.pop(kind, [])[:5]]
+        told = by_kind.pop(kind, [])
+        lines += [f"{word} at frame {event['frame_index']}: {event['detail']}." for event in told[:_TOLD]]
+        if len(told) > _TOLD:
+            more = ranges([event["frame_index"] for event in told[_TOLD:]])
+            lines.append(f"{word} {len(told) - _TOLD} times more, at frames {more}.")
     waiting = by_kind.pop("initialising", [])
     if waiting and report["frames"]["lost"]:  # frames that only waited get their pose once the map has begun
         last = waiting[-1]

@@ -13,7 +13,7 @@ import numpy as np
 from improvo.geometry import se3
 from improvo.self_calibration.elimination import back_substitute, eliminate
 from improvo.self_calibration.lens import Lens
-from improvo.types import Float64, Int64
+from improvo.types import Float64, Int64, Mask
 
 LOSS_WIDTH = 0.25  # pixels, of Cauchy's loss: below the noise, so that points that drift along an edge count little
 _FITS = 3.0  # pixels, of observations that are no outliers
@@ -45,11 +45,14 @@ class Scene:
         errors = np.linalg.norm(_residuals(self)[0], axis=1)
         return np.where(np.isfinite(errors), errors, np.inf)
 
-    def without(self, drop: np.ndarray, min_views: int = 3) -> Scene:
-        """Without these observations (M,), and without points that too few views are left of."""
+    def kept(self, drop: Mask, min_views: int = 3) -> Mask:
+        """Which observations (M,) are left without these, and without points that too few views are left of."""
         keep = ~drop
         count = np.bincount(self.point[keep], minlength=len(self.xyz))
-        keep &= (count >= min_views)[self.point]
+        return np.asarray(keep & (count >= min_views)[self.point])
+
+    def only(self, keep: Mask) -> Scene:
+        """With these observations (M,) alone, and the points that they see."""
         used, point = np.unique(self.point[keep], return_inverse=True)
         return replace(self, xyz=self.xyz[used], view=self.view[keep], point=point, pixels=self.pixels[keep])
 
@@ -62,11 +65,6 @@ class Adjusted:
     cost: float
     rms: float  # pixels, of the observations that fit (within 3)
     covariance: Float64  # (7, 7) of the lens, and of the read-out
-
-    @property
-    def cost_of_each(self) -> float:
-        """Of an observation, on average."""
-        return self.cost / max(len(self.scene.view), 1)
 
 
 def adjust(scene: Scene, iterations: int = _ITERATIONS) -> Scene:
@@ -137,6 +135,11 @@ def covariance(scene: Scene) -> Float64:
     plain = inverse * (float((weights * (residuals**2).sum(axis=1)).sum()) / freedom)
     scale = np.sqrt(np.maximum(np.diag(clustered), np.diag(plain)) / np.diag(plain))
     return plain * np.outer(scale, scale)
+
+
+def outlier_cost(pixels: float) -> float:
+    """What an observation so far off adds to the cost."""
+    return float(0.5 * LOSS_WIDTH**2 * np.log1p((pixels / LOSS_WIDTH) ** 2))
 
 
 def _summed(scores: Float64, group: Int64) -> Float64:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +15,14 @@ from improvo.files import write_json, write_text
 from improvo.frontend.registry import frontend_from
 from improvo.geometry.camera import Camera
 from improvo.geometry.camera_files import calibration_yaml
-from improvo.self_calibration.adjustment import Adjusted, Scene, adjust, adjusted
+from improvo.self_calibration.adjustment import Adjusted, Scene, adjust, adjusted, outlier_cost
 from improvo.self_calibration.first_guess import Guess, agreement, far_pairs, guesses
 from improvo.self_calibration.lens import MODELS, NAMES, Lens
 from improvo.self_calibration.raw_features import Piece, detect_pieces, open_raw, piece_rows
 from improvo.self_calibration.settings import SelfCalibrationSettings
 from improvo.self_calibration.tracked import TrackedPiece, scene_of, track_piece
 from improvo.terminal import counted
+from improvo.types import Mask
 
 _MIN_FRAMES = 20
 _MIN_PAIRS = 2
@@ -239,18 +239,35 @@ def _adjusted_lens(maps: list[TrackedPiece], lens: Lens, settings: SelfCalibrati
     scene = scene_of(maps, lens, settings.views)
     if len(scene.cam_from_world) < _MIN_VIEWS or len(scene.xyz) < _MIN_POINTS:
         return None
-    fit = partial(_fit, scene)
-    best = fit(lens)
+    best = _fit(scene, lens)
     if settings.model == "auto" and lens.distorted:
-        brown, fisheye = (best if lens.model == model else fit(lens.as_model(model)) for model in MODELS)
-        best = fisheye if fisheye.cost_of_each < _SIMPLER * brown.cost_of_each else brown
-    return LensFound(best, tracked) if len(best.scene.xyz) >= _MIN_POINTS else None
+        brown, fisheye = (best if lens.model == model else _fit(scene, lens.as_model(model)) for model in MODELS)
+        best = fisheye if _cost_beside(fisheye, brown) < _SIMPLER * _cost_beside(brown, fisheye) else brown
+    return LensFound(best.adjusted, tracked) if len(best.adjusted.scene.xyz) >= _MIN_POINTS else None
 
 
-def _fit(scene: Scene, lens: Lens) -> Adjusted:
+@dataclass(frozen=True)
+class _Fit:
+    """A scene adjusted with one model, and which of its observations (M,) took part."""
+
+    adjusted: Adjusted
+    kept: Mask
+
+
+def _fit(scene: Scene, lens: Lens) -> _Fit:
     """A scene adjusted, its outliers left out, and adjusted again."""
     rough = adjust(replace(scene, lens=lens), _ROUGH)
-    return adjusted(rough.without(rough.errors() > _OUTLIER))
+    kept = rough.kept(rough.errors() > _OUTLIER)
+    return _Fit(adjusted(rough.only(kept)), kept)
+
+
+def _cost_beside(fit: _Fit, other: _Fit) -> float:
+    """Cost of an observation, on average of those that one of the two fits kept.
+
+    Those that only the other kept count as outliers: a model that is wrong at the rim leaves the rim out.
+    """
+    missing = int((other.kept & ~fit.kept).sum())
+    return (fit.adjusted.cost + missing * outlier_cost(_OUTLIER)) / max(int((fit.kept | other.kept).sum()), 1)
 
 
 def _different(tried: list[Guess]) -> list[Guess]:

@@ -63,13 +63,14 @@ def sampled_pictures(sequence: Sequence, samples: int) -> Iterator[tuple[str, UI
 
 
 def piece_rows(times: Float64, frames: int, pieces: int, max_rate: float) -> list[range]:
-    """Rows of the pieces: frames at most so often a second; all of them, or `pieces` of equal length spread over them.
+    """Rows of the pieces: all frames that are used, or `pieces` of equal length spread over them.
 
     Args:
         times: (N,) seconds of the recording's frames.
         frames: at most, in all pieces.
         pieces: where there are more.
-        max_rate: frames a second; of a faster recording every second, third, ... frame is used.
+        max_rate: frames a second that are enough; every second, third, ... frame is used where as many are left then
+            (a tenth fewer at most). So of a recording of less than twice that rate all are.
     """
     interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     step = max(1, int(1.1 / (max_rate * interval))) if interval > 0 else 1

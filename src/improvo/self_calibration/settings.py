@@ -20,7 +20,7 @@ class SelfCalibrationSettings:
     model: str = "auto"  # of the distortion: brown, fisheye, or the one that explains the video clearly better
     frames: int = 400  # looked at; of a longer video, pieces spread over it
     pieces: int = 2
-    max_rate: float = 15.0  # frames a second that are looked at
+    max_rate: float = 15.0  # frames a second that are enough; of a recording twice as fast every second is looked at
     max_width: int = 1280  # pixels in which keypoints are detected
     pairs: int = 16  # of frames, for the first guess
     views: int = 140  # adjusted together with the camera

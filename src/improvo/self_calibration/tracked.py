@@ -116,7 +116,7 @@ def scene_of(pieces: list[TrackedPiece], lens: Lens, max_views: int) -> Scene:
         np.array(worlds),
         np.array(motions),
     )
-    return scene.without(np.zeros(len(view), bool))
+    return scene.only(scene.kept(np.zeros(len(view), bool)))
 
 
 def _motion(views: list[FinalView], row: int) -> Float64:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from improvo.errors import ConfigError
 from improvo.sequences.base import SequenceSettings
 
 
@@ -13,3 +14,7 @@ class InfoSettings:
 
     sequence: SequenceSettings = field(default_factory=SequenceSettings)
     samples: int = 120  # pairs of neighbouring frames that are decoded, spread over the recording
+
+    def __post_init__(self) -> None:
+        if self.samples < 1:
+            raise ConfigError(f"samples={self.samples}: must be at least 1")

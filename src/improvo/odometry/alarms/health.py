@@ -62,6 +62,7 @@ class HealthCheck:
         self._descriptor_distance = descriptor_distance
         self._rounds: deque[Int64] = deque(maxlen=_ROUNDS)  # of (gaps, 4) map and own inliers, all and tracked
         self._two_motions = 0  # checks in a row that saw two
+        self._has_judged = False
 
     def contradicts(self, view: View, earlier: Mapping[int, View]) -> bool:
         """Whether the last checks together say that the map is wrong.
@@ -88,6 +89,7 @@ class HealthCheck:
         self._two_motions = self._two_motions + 1 if two_motions else 0
         if len(self._rounds) < _ROUNDS:
             return False
+        self._has_judged = True
         map_inliers, own_inliers, map_tracked, own_tracked = np.sum(self._rounds, axis=(0, 1))
         decides = own_inliers >= _ROUNDS * self._settings.start.min_points
         # A wall of repeated texture, matched one repetition off, moves rigidly, too; tracks seldom make that mistake.
@@ -109,7 +111,11 @@ class HealthCheck:
     @property
     def has_judged(self) -> bool:
         """Whether there were checks enough to say that a map is wrong."""
-        return len(self._rounds) == _ROUNDS
+        return self._has_judged
+
+    def start_over(self) -> None:
+        """What the last checks said was looked into, and counts no more."""
+        self._rounds.clear()
 
     @property
     def ambiguous(self) -> bool:

@@ -35,12 +35,13 @@ class Bridging:
     """Looks for the former maps in the views of a new one.
 
     Args:
-        settings: of the odometry; `bridging` says how long, and `verdict.max_error` how sure.
+        settings: of the odometry; `bridging` says how long, `verdict.max_error` and `start.min_points` how sure.
     """
 
     def __init__(self, settings: OdometrySettings) -> None:
         self._max_frames = settings.bridging.max_frames
         self._max_error = settings.verdict.max_error / 100.0  # of the scale, and of places as a share of their distance
+        self._min_points = settings.start.min_points
         self._former: list[FormerMap] = []
         self._sightings: dict[int, list[Sighting]] = {}  # by row of the former map
         self._found = False  # in which the running map lies
@@ -72,7 +73,9 @@ class Bridging:
                 continue
             for other in self._sightings.get(row, []):
                 join = _joined(former, other, sighting, self._max_error)
-                if join is not None and join.scale_error <= self._max_error:
+                if join is None or join.points < self._min_points:  # a place that looks alike has a few points, too
+                    continue
+                if join.scale_error <= self._max_error:
                     self._found = True
                     return join
             self._sightings.setdefault(row, []).append(sighting)

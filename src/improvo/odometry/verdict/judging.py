@@ -46,7 +46,8 @@ class SegmentJudge:
 
         Args:
             words: plain.
-            times: how often it was so, each of which makes a smaller error enough; of several, the largest counts.
+            times: how often it was so, each of which makes a smaller error enough; of several, the largest counts. Zero
+                tells it only.
         """
         self._suspected = max(self._suspected, times)
         if words not in self._suspicions:
