@@ -181,11 +181,13 @@ def _solve_once(views: list[View], size: tuple[int, int], model: str, before: Ca
 def _solve_fisheye(views: list[View], size: tuple[int, int], before: Camera | None) -> _Solved | None:
     points = [view.points.reshape(1, -1, 3).astype(np.float64) for view in views]
     pixels = [view.pixels.reshape(1, -1, 2).astype(np.float64) for view in views]
-    found = None if before is not None else _calibrated_fisheye(points, pixels, size, None)
-    if found is None:  # OpenCV's own start fails on views at the rim
-        starts = [before] if before is not None else [_equidistant(fov, size) for fov in _FISHEYE_STARTS]
-        tried = [each for start in starts if (each := _calibrated_fisheye(points, pixels, size, start)) is not None]
-        found = min(tried, key=lambda each: each[0], default=None)
+    found = _calibrated_fisheye(points, pixels, size, before)
+    if found is None or found[0] > MAX_RMS:  # OpenCV's own start gives up or ends anywhere, for views at the rim
+        tried = [
+            found,
+            *(_calibrated_fisheye(points, pixels, size, _equidistant(fov, size)) for fov in _FISHEYE_STARTS),
+        ]
+        found = min((each for each in tried if each is not None), key=lambda each: each[0], default=None)
     if found is None:
         return None
     rms, matrix, distortion, rotations, translations = found
