@@ -211,7 +211,7 @@ def frozen(clip: Clip, rng: np.random.Generator) -> Clip:
 
 
 def scene_cut(clip: Clip, rng: np.random.Generator) -> Clip:
-    """In the middle the stream jumps back to the beginning, mirrored in time: another place at once."""
+    """In the middle the stream jumps to its end and goes backwards from there: another place at once."""
     middle = len(clip) // 2
     return clip.take(np.concatenate([np.arange(middle), np.arange(len(clip) - 1, middle - 1, -1)]))
 
