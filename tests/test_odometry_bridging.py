@@ -10,6 +10,8 @@ from simulated_features import CAMERA, World, error_percent, hand_motion, nothin
 
 from improvo.geometry import se3
 from improvo.geometry.a_contrario import disc_probability, log10_false_alarms
+from improvo.geometry.alignment import Similarity
+from improvo.odometry.mapping.course import Course
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import BridgingSettings, OdometrySettings
 from improvo.odometry.states import TrackingState
@@ -51,6 +53,51 @@ def test_a_camera_that_comes_back_goes_on_in_the_same_world_and_scale() -> None:
     assert segment.verdict.word == "right"
     assert any("joined" in words for words in segment.verdict.evidence)
     assert set(odometry.map.segment.tolist()) == {0}
+
+
+@pytest.mark.parametrize(("metres", "segments"), [(1.0, [(0, 111)]), (2.5, [(0, 49), (62, 111)])])
+def test_a_place_that_cannot_be_reached_within_the_gap_only_looks_the_same(
+    metres: float, segments: list[tuple[int, int]]
+) -> None:
+    features, _ = with_a_gap(back=40)
+    ahead = TRUTH[40:90].copy()
+    ahead[:, 2, 3] += metres  # within thirteen frames, of which each had at most 0.04 m
+    odometry = run([*features[: 50 + GAP], *(observe(room(), pose, seed=100 + i) for i, pose in enumerate(ahead))])
+    assert [(each.first, each.last) for each in odometry.segments] == segments
+    assert all(segment.verdict.word == "right" for segment in odometry.segments)
+
+
+@pytest.mark.parametrize(
+    ("frame", "seconds", "place", "leaps"),
+    [
+        (12, 1.2, 2.9, False),  # less than three times as fast over two frames
+        (12, 1.2, 6.4, True),
+        (12, 5.0, 6.4, False),  # frames were left out: four seconds are long enough
+        (50, 1.2, 6.4, False),  # times are wrong: forty frames are enough
+        (12, 0.5, 2.9, False),  # times that go back say nothing
+        (10, 1.0, 0.9, True),
+    ],
+)
+def test_what_a_camera_can_reach(frame: int, seconds: float, place: float, leaps: bool) -> None:
+    def course(first: int, start: float, x: float) -> Course:
+        steps = np.arange(5.0)
+        return Course(
+            np.stack([first + steps, start + 0.1 * steps], axis=1), np.outer(x + 0.4 * steps, [1.0, 0.0, 0.0])
+        )
+
+    before = course(6, 0.6, -1.6)  # ends with frame 10, after a second, at zero
+    assert course(frame, seconds, place).is_leap_from(before, slack=0.5) == leaps
+
+
+def test_a_course_in_another_world() -> None:
+    course = Course(np.array([[0.0, 0.0], [2.0, 0.2]]), np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(course.fastest, [0.5, 5.0])
+    np.testing.assert_allclose(course.placed(Similarity(3.0, np.eye(3), np.ones(3))).centers, [[1, 1, 1], [4, 1, 1]])
+    alone = Course(np.zeros((1, 2)), np.zeros((1, 3)))
+    np.testing.assert_array_equal(alone.fastest, [0.0, 0.0])
+    nothing = Course(np.zeros((0, 2)), np.zeros((0, 3)))
+    assert not nothing.is_leap_from(course, 0.0)
+    assert not course.is_leap_from(nothing, 0.0)
 
 
 def test_without_bridging_it_begins_another_segment() -> None:

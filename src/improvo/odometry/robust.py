@@ -191,7 +191,7 @@ class RobustMapper(Mapper):
         if not self._states.is_provisional:
             return
         for view in views:
-            join = self._bridging.look(view, local_map.store.xyz) if view.keyframe else None
+            join = self._bridging.look(view, local_map.store.xyz, self._provisional) if view.keyframe else None
             if join is None:
                 continue
             self._result.join(join.number, join.shared_from_new, join.scale_error)

@@ -1,11 +1,13 @@
 """Joining a new map with that of a segment that ended before, where the camera sees the same place again.
 
-Two views of the new map must find the former one, and agree on where it lies and how large it is. Otherwise two
-segments with scales of their own stand side by side, placed by guess.
+Two views of the new map must find the former one, and agree on where it lies and how large it is, and the camera must
+have been able to come from there to here. Otherwise two segments with scales of their own stand side by side, placed by
+guess.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +15,7 @@ import numpy as np
 from improvo.geometry import se3
 from improvo.geometry.alignment import Similarity
 from improvo.odometry.gates import SAME_SCALE, SAME_TURN_DEG
+from improvo.odometry.mapping.course import Course
 from improvo.odometry.mapping.former_map import FormerMap, Sighting
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
@@ -55,12 +58,13 @@ class Bridging:
         """What was seen from another map does not count any more."""
         self._sightings, self._found = {}, False
 
-    def look(self, view: View, xyz: Float64) -> Join | None:
+    def look(self, view: View, xyz: Float64, running: Sequence[View]) -> Join | None:
         """The join that this view decides, if it and another one agree.
 
         Args:
             view: of the running map, with a pose.
             xyz: (P, 3) points of the running map.
+            running: its views from the first one on.
         """
         if self._found:
             return None
@@ -75,9 +79,16 @@ class Bridging:
                 join = _joined(former, other, sighting, self._max_error)
                 if join is None or join.points < self._min_points:  # a place that looks alike has a few points, too
                     continue
-                if join.scale_error <= self._max_error:
-                    self._found = True
-                    return join
+                if join.scale_error > self._max_error:
+                    continue
+                here = Course.of(running).placed(join.shared_from_new)
+                # where texture repeats, a place one repetition off looks the same, in every view
+                if here.is_leap_from(
+                    former.course, slack=self._max_error * sighting.depth * former.shared_from_own.scale
+                ):
+                    continue
+                self._found = True
+                return join
             self._sightings.setdefault(row, []).append(sighting)
         return None
 
