@@ -202,11 +202,18 @@ def test_a_second_run_that_is_stopped_between_its_files_is_no_result(
 
 
 def test_a_second_run_takes_away_what_it_does_not_write_again(out: Path, walk: Path, tmp_path: Path) -> None:
-    """Depth, a page and a found camera of the first run are not those of the second."""
+    """Depth, a page, pictures and a found camera of the first run are not those of the second."""
+    shown, own = ("map.png", "tracks.gif", "labels/labels_000004.png"), ("notes.txt", "mine.png")
+    for name in (*shown, *own):
+        (out / "pictures" / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / "pictures" / name).write_text("of the first run")
     for name in ("depth.zip", "dense.ply", "report.html", "camera.yaml", "camera.json"):
         (out / name).write_text("of the first run")
     assert main(words(walk, out)) == 0
-    assert not {"depth.zip", "dense.ply", "report.html", "camera.yaml", "camera.json"} & set(without_times(out))
+    left = {path.name for path in out.iterdir()}
+    assert not {"depth.zip", "dense.ply", "report.html", "camera.yaml", "camera.json"} & left
+    assert sorted(path.name for path in (out / "pictures").rglob("*") if path.is_file()) == ["mine.png", "notes.txt"]
+    shutil.rmtree(out / "pictures")
     (out / "camera.yaml").write_text((walk / "camera.yaml").read_text())  # the user's own
     assert main(words(walk, out)) == 0
     assert (out / "camera.yaml").is_file()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
@@ -38,6 +39,7 @@ from improvo.terminal import counted
 from improvo.types import Trajectory
 
 _ADDED = ("depth.zip", "dense.ply", "report.html")  # by later steps of some runs
+_SHOWN = re.compile(r"(map|(tracks|residuals|labels)(_\d+)?)\.(png|gif|webp|mp4|webm)")  # by `improvo show`
 _MIN_FRAMES = 3
 
 
@@ -148,8 +150,9 @@ def _remove_result(folder: Path, settings: RunSettings) -> None:
     found, camera = folder / "camera.json", settings.sequence.camera
     if found.is_file() and (camera is None or Path(camera).absolute() != found.with_suffix(".yaml").absolute()):
         names += [found.name, "camera.yaml"]  # found for the earlier run, it would be taken for that of this one
-    for name in names:
-        (folder / name).unlink(missing_ok=True)
+    pictures = [path for path in (folder / "pictures").rglob("*") if _SHOWN.fullmatch(path.name)]
+    for path in [*(folder / name for name in names), *pictures]:
+        path.unlink(missing_ok=True)
 
 
 def _track_all(
