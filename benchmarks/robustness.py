@@ -34,7 +34,7 @@ from typing import Any
 import cv2
 
 from improvo.backend.compile import compile_kernels
-from improvo.files import write_json
+from improvo.files import content_hash, write_json
 from improvo.frontend.registry import load_frontend
 from robustness_cases import HALVES, REAL, Case, cases
 from robustness_features import FeatureCache
@@ -72,7 +72,10 @@ def main() -> None:
 
 
 def _file(arguments: argparse.Namespace, case: Case, frontend: str) -> Path:
-    return Path(arguments.results) / f"{case.name}-{Path(frontend).stem}.json"
+    name = Path(frontend).stem
+    if frontend.endswith(".safetensors"):  # files of different folders are often called the same
+        name += f"-{content_hash(Path(frontend))[:8]}"
+    return Path(arguments.results) / f"{case.name}-{name}.json"
 
 
 def _run(missing: list[tuple[Case, str]], arguments: argparse.Namespace) -> None:
