@@ -146,7 +146,7 @@ def map_png(
     title = _title(run, len(shown), int((~inside).sum()), truth)
     if narrow:
         title = "\n".join(textwrap.fill(line, _NARROW_LINE) for line in title.splitlines())
-    figure.suptitle(title, fontsize=8 if narrow else 10)
+    axis.set_title(title, fontsize=8 if narrow else 10)  # above the axis, however much of the figure that fills
     _time_bar(figure, axis, palette, run.frames, len(last))
     png = io.BytesIO()
     figure.savefig(png, dpi=220 if narrow else 150, format="png", bbox_inches="tight", metadata={"Software": None})
