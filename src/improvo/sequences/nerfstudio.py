@@ -22,6 +22,7 @@ from improvo.sequences.images import listed_file, natural_key, read_depth
 from improvo.sequences.rates import frame_rate
 from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
 from improvo.types import Float32, Float64, UInt8
+from improvo.untrusted.limits import MAX_PIXELS
 
 _NAMES = ("transforms.json", "transforms_train.json")
 _NO_LENS = {
@@ -114,9 +115,10 @@ def _calibration(
 
 
 def _size(content: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[int, int] | None:
-    """Width and height of the images, None where the file does not say."""
+    """Width and height of the images, None where the file does not say, or says what no picture can have."""
     values = numbers([_value(frames[0], content, "w"), _value(frames[0], content, "h")], 2)
-    return (int(values[0]), int(values[1])) if np.isfinite(values).all() and (values >= 1).all() else None
+    possible = np.isfinite(values).all() and (values >= 1).all() and values.prod() <= MAX_PIXELS
+    return (int(values[0]), int(values[1])) if possible else None
 
 
 def _size_of_picture(images: ImageFiles) -> tuple[int, int] | None:

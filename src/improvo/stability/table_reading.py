@@ -69,7 +69,9 @@ def _reading(path: Path, schema: pa.Schema, read: Callable[[Any], Found]) -> Fou
 
 
 def _cast(table: pa.Table, schema: pa.Schema) -> pa.Table:
-    return table.select(schema.names).cast(schema)
+    cast = table.select(schema.names).cast(schema)
+    cast.validate(full=True)  # else words by number are looked up beyond the list of words
+    return cast
 
 
 def _checked(path: Path, table: pa.Table) -> pa.Table:
