@@ -6,15 +6,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from simulated_features import CAMERA, hand_motion, observe, room
+from simulated_features import CAMERA, hand_motion, observe, room, views_of
 
 from improvo.geometry import se3
 from improvo.odometry.alarms.second_map import SecondOpinion, explained_tracks, same_poses
 from improvo.odometry.events import EventLog
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
-from improvo.tracking.connect import TrackChain
-from improvo.tracking.matching import match_units, unit_descriptors
 from improvo.types import Float64
 
 FRAMES = 30
@@ -24,21 +22,9 @@ MAX_ERROR = 5.0
 
 def tracked(believed: Float64, true: Float64 = TRUTH) -> list[View]:
     """Views at `true` poses (N, 4, 4 world_from_cam), with tracks, that a map believes to be at `believed`."""
-    world, chain, views = room(), TrackChain(), list[View]()
-    for number, (pose, said) in enumerate(zip(true, believed, strict=True)):
-        features = observe(world, pose, seed=number)
-        descriptors = unit_descriptors(features)
-        if views:
-            matches = match_units(views[-1].descriptors, descriptors, 0.7)
-            tracks = chain.extend(views[-1].tracks, matches, len(features))
-        else:
-            tracks = chain.start(len(features))
-        nothing = np.full(len(features), -1, np.int64)
-        keypoints = features.keypoints.astype(np.float64)
-        weights = np.ones(len(features))
-        view = View(number, number / 30, keypoints, descriptors, weights, tracks, nothing)
+    views = views_of([observe(room(), pose, seed=number) for number, pose in enumerate(true)])
+    for view, said in zip(views, believed, strict=True):
         view.cam_from_world = se3.inverse(said)
-        views.append(view)
     return views
 
 

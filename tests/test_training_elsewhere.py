@@ -23,8 +23,8 @@ from improvo.training.held import HeldStage  # noqa: E402
 from improvo.training.held_settings import ElsewhereSettings, HeldSettings  # noqa: E402
 from improvo.training.held_training import train_held  # noqa: E402
 from improvo.training.pictures import Pictures  # noqa: E402
-from improvo.training.trainer import Trainer  # noqa: E402
 from test_training_held import SMALL, photographs  # noqa: E402
+from training_examples import stopped_after  # noqa: E402
 
 START = find_weights("superpoint-small")
 HOLDING = replace(SMALL, elsewhere=ElsewhereSettings(weight=1.0), frozen_layers=4, fixed_statistics=True)
@@ -102,18 +102,8 @@ def test_descriptors_of_other_places_move_less_where_they_are_held(tmp_path: Pat
 
 def test_a_killed_training_that_is_held_elsewhere_ends_with_the_same_weights(tmp_path: Path) -> None:
     whole = trained(HOLDING, tmp_path / "whole")
-    step, made = Trainer._step, []
-
-    def dies(self: Any, batch: Any) -> Any:
-        if len(made) == 7:
-            raise KeyboardInterrupt
-        made.append(1)
-        return step(self, batch)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Trainer, "_step", dies)
-        with pytest.raises(KeyboardInterrupt):
-            trained(HOLDING, tmp_path / "parts")
+    with stopped_after(7):
+        trained(HOLDING, tmp_path / "parts")
     parts = trained(HOLDING, tmp_path / "parts")
     assert all(np.array_equal(whole.tensors[name], parts.tensors[name]) for name in whole.tensors)
     assert whole.card.training["settings"]["elsewhere"]["weight"] == 1.0

@@ -38,6 +38,7 @@ from improvo.training.settings import OptimiserSettings, PhotometricSettings, Vi
 from improvo.training.stage import Stage  # noqa: E402
 from improvo.training.trainer import Trainer  # noqa: E402
 from improvo.training.views import inside, warp_image, warp_points  # noqa: E402
+from training_examples import stopped_after  # noqa: E402
 
 CPU = torch.device("cpu")
 AS_IT_IS = PhotometricSettings(
@@ -349,18 +350,8 @@ def test_a_killed_training_ends_with_the_same_weights_and_holds_the_other_heads(
     arguments = (Pictures((photographs(),)), [posed_room()])
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     row = train_held(*arguments, SMALL, whole, start, teacher, progress=False)
-    step, made = Trainer._step, []
-
-    def dies(self: Any, batch: Any) -> Any:
-        if len(made) == 7:
-            raise KeyboardInterrupt
-        made.append(1)
-        return step(self, batch)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Trainer, "_step", dies)
-        with pytest.raises(KeyboardInterrupt):
-            train_held(*arguments, SMALL, parts, start, teacher, progress=False)
+    with stopped_after(7):
+        train_held(*arguments, SMALL, parts, start, teacher, progress=False)
     train_held(*arguments, SMALL, parts, start, teacher, progress=False)
     ends = [load_weights(folder / "weights.safetensors") for folder in (whole, parts)]
     assert all(np.array_equal(ends[0].tensors[name], ends[1].tensors[name]) for name in ends[0].tensors)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import torch
 
@@ -24,3 +28,22 @@ def tiny_trainer(folder: Path, steps: int = 1) -> Trainer:
     settings = ShapesSettings(optimiser=optimiser, views=ViewSettings(height=48, width=64))
     torch.manual_seed(0)
     return Trainer(MagicPointStage(SuperPoint(TINY)), ShapeBatches(settings), optimiser, folder)
+
+
+@contextmanager
+def stopped_after(steps: int) -> Iterator[None]:
+    """A training within ends, as by Ctrl-C, where it would make one step more."""
+    step, made = Trainer._step, []
+
+    def dies(self: Any, batch: Any) -> Any:
+        if len(made) == steps:
+            raise KeyboardInterrupt
+        made.append(1)
+        return step(self, batch)
+
+    with mock.patch.object(Trainer, "_step", dies):
+        try:
+            yield
+        except KeyboardInterrupt:
+            return
+    raise AssertionError(f"it ends within {steps} steps")

@@ -36,13 +36,8 @@ if TYPE_CHECKING:
 
 NO_RESULT = 3  # exit status where everything was read, and no frame has a pose
 _WARNINGS = 5  # printed; run.json has them all
-_UNSAID = (
-    "initialising",
-    "segment",
-    "doubtful",
-    "uncertain",
-    "checked again",
-)  # events that other lines say, or no alarm
+# kinds of events that other lines say, or that are no alarm
+_UNSAID = ("initialising", "segment", "doubtful", "uncertain", "checked again")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
