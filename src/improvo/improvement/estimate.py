@@ -110,7 +110,8 @@ def estimate(
     if settings.recipe == HELD and settings.held.pairs.whole_frames:
         remembered = min(taught, settings.held.pairs.frames_remembered)
         memory += remembered * _MIB_PER_REMEMBERED * small / (640 * 480)
-    disk = 60 + 0.1 * (training + held_back) * (1 + judged) + deep * pixels / 4 * 1.3 / _MIB + 12 * trainings
+    labels = 0.1 * (training + held_back + rounds * labeled + (1 + judged) * held_back)
+    disk = 60 + labels + deep * pixels / 4 * 1.3 / _MIB + 12 * trainings
     return Estimate((frames * costs.frame + others) / 60, memory, disk, steps, frames, others / 60)
 
 
