@@ -197,7 +197,7 @@ def test_the_control_has_as_many_rounds_and_steps_as_what_is_kept(
     assert [call["seed"] for call in training.calls[3:]] == [0, 1]
     start = result.candidates[0]
     assert [call["start"] for call in training.calls[3:]] == [start.weights, out / "control-1" / "weights.safetensors"]
-    # other places are held to what the start says of them, in every round and control
+    # every later one, control or not, goes back towards the start
     assert [call["first"] for call in training.calls] == [None, start.weights, start.weights, None, start.weights]
     assert result.control is not None
     assert result.control[0].name == "control, 2 rounds"

@@ -37,7 +37,7 @@ class TrainingJob:
     steps: int = 0  # of the control; 0 for what the settings say
     data: tuple[DataSource, ...] = ()
     progress: bool = True
-    first: Path | None = None  # weights that the loop began with, if other than `start`: what is known of other places
+    first: Path | None = None  # weights that the loop began with, if other than `start`
 
     @property
     def weights(self) -> Path:
@@ -113,7 +113,6 @@ def _train_held(job: TrainingJob) -> dict[str, Any]:
         job.output,
         job.start,
         job.start if has_head else None,
-        job.first,
         job.data,
         job.progress,
         0.0 if job.control else 60 * job.settings.minutes,

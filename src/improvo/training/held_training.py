@@ -33,7 +33,6 @@ def train_held(
     output: Path,
     start: Path,
     stability_from: Path | None = None,
-    elsewhere_from: Path | None = None,
     data: tuple[DataSource, ...] = (),
     progress: bool = True,
     seconds: float = 0.0,
@@ -44,8 +43,6 @@ def train_held(
     Args:
         start: weights to start from, whose detector is held.
         stability_from: weights whose stability head is held to; without it the result has no such head.
-        elsewhere_from: weights that all heads are held to on pictures of other places, of the same frozen layers;
-            `start` by default.
         data: what the model card says about the pictures; the sources' names where it is empty.
         seconds: of preparing and training; where given, the number of steps follows from it.
         labels: label stores, whose tracks teach in every second step; left out where no frame has enough of them, and
@@ -65,9 +62,7 @@ def train_held(
     )  # fmt: skip
     batches = dense if dense.whole else _with_tracks(dense, labels, output)
     if settings.elsewhere.weight:
-        known = load_weights(elsewhere_from) if elsewhere_from else parent
-        steady = known if elsewhere_from and stability and known.architecture.stability else stability
-        batches = HeldElsewhere(batches, bundled_pictures(), known, steady, settings, device, precision)
+        batches = HeldElsewhere(batches, bundled_pictures(), parent, stability, settings, device, precision)
     if not data:
         names = (*(source.name for source in pictures.sources), *(sequence.name for sequence in posed))
         data = not_stated(names)
