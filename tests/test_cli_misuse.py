@@ -23,6 +23,7 @@ from improvo.cli.config import SETTINGS
 from improvo.cli.main import main
 from improvo.cli.output import configured, next_step, notice, say, typed
 from improvo.errors import ConfigError
+from improvo.files import make_output_folder
 from improvo.sequences import open_sequence
 from improvo.terminal import one_line, printable
 
@@ -292,6 +293,43 @@ def test_a_folder_that_may_not_be_looked_into_is_one_line(
     assert message.startswith(f"improvo: {secret / 'deep'}")
     assert message.count("\n") == 1
     assert "ermission" in message
+
+
+@pytest.mark.parametrize(
+    ("words", "secret"),
+    [
+        (("info", "{video}"), "{video}"),
+        (("info", "{walk}"), "{walk}"),
+        (("run", "{walk}", "-o", "{new}", "--frontend", "{weights}"), "{weights}"),
+        (("weights", "show", "{weights}"), "{weights}"),
+        (("report", "{run}"), "{run}/run.json"),
+        (("label", "{walk}", "-o", "{store}", *ORB), "{store}/settings.yaml"),
+    ],
+    ids=lambda words: "-".join(words[:2]).replace("{", "").replace("}", "") if isinstance(words, tuple) else "",
+)
+def test_what_may_not_be_read_is_neither_damaged_nor_missing(
+    words: tuple[str, ...],
+    secret: str,
+    walk: Path,
+    video: Path,
+    finished: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    store, weights = tmp_path / "store", tmp_path / "own.safetensors"
+    make_output_folder(store, "label")
+    (store / "settings.yaml").write_text("frontend: {name: orb}\n")
+    weights.write_bytes(b"not looked at")
+    names = {"video": video, "walk": walk, "run": finished, "new": tmp_path / "new", "store": store, "weights": weights}
+    locked, may = secret.format(**names), os.access
+
+    def access(path: Any, mode: int) -> bool:
+        return os.fspath(path) != locked and may(path, mode)
+
+    monkeypatch.setattr(os, "access", access)  # root may read everything
+    told = refused(tuple(word.format(**names) for word in words), capsys)
+    assert f"{locked}: no permission to read it; choose another, or change that" in told
 
 
 def test_the_next_command_can_be_pasted_whatever_the_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -45,7 +45,7 @@ class ReferenceSettings:
     depth: DepthSettings = field(default_factory=DepthSettings)
 
     def __post_init__(self) -> None:
-        if self.frames_per_second <= 0 or self.stretch_seconds <= 0:
+        if not (self.frames_per_second > 0 and self.stretch_seconds > 0):
             raise ConfigError("settings `reference.frames_per_second` and `reference.stretch_seconds`: must be above 0")
         if min(self.dense_up_to, self.most_training, self.most_held_back) < 2:
             raise ConfigError(
@@ -77,6 +77,12 @@ class ValidationSettings:
             raise ConfigError("validation.overlaps: give the largest first")
         if self.min_pairs < 1:
             raise ConfigError(f"validation.min_pairs={self.min_pairs}: must be at least 1")
+        if not 0 <= self.frames_lost <= 1:
+            raise ConfigError(f"validation.frames_lost={self.frames_lost}: is a share between 0 and 1")
+        if self.segments_more < 0:
+            raise ConfigError(f"validation.segments_more={self.segments_more}: must not be negative")
+        if self.calibration_images < 1:
+            raise ConfigError(f"validation.calibration_images={self.calibration_images}: must be at least 1")
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from improvo.config import check_seed
 from improvo.errors import ConfigError, InputError
 from improvo.evaluation.measures import PairGeometry, relative_motion
 from improvo.evaluation.pose.protocol import Records, evaluate_pair
@@ -45,8 +46,9 @@ class SelfTruthSettings:
         if min(self.pairs, self.shuffles, self.resamples, self.min_matches) < 1 or self.max_keypoints < 4:
             raise ConfigError("pairs, shuffles, resamples and min_matches must be at least 1, max_keypoints at least 4")
         limits = (*self.right_px, self.max_rotation_deg, self.max_translation)
-        if min(limits) <= 0 or not 0 < self.confidence < 1:
+        if not (all(limit > 0 for limit in limits) and 0 < self.confidence < 1):
             raise ConfigError("thresholds must be positive, and confidence between 0 and 1")
+        check_seed(self.seed)
 
 
 @dataclass(frozen=True)
