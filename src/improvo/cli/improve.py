@@ -175,6 +175,6 @@ def _plan(arguments: argparse.Namespace, settings: ImproveSettings) -> int:
         plan = plan_improvement(
             arguments.sequences, settings, arguments.rounds, arguments.evaluate, shown.advance, arguments.after
         )
-    say_improve_plan(plan)
+    say_improve_plan(plan, arguments.rounds is not None)
     next_step("the same without --plan and with -o OUT does it")
     return 0
