@@ -299,3 +299,17 @@ def test_a_folder_that_holds_another_recording_by_now_is_looked_at_anew(
     side.write_text(json.dumps(content))
     find_cameras([place], SequenceSettings(camera="auto"), out)
     assert asked == [place, place]
+
+
+@pytest.mark.parametrize("gone", [0, 22, 44])
+def test_a_recording_with_a_damaged_frame_is_still_told_from_another(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gone: int
+) -> None:
+    asked = counted(monkeypatch)
+    out, place = tmp_path / "out", tmp_path / "frames"
+    out.mkdir()
+    shutil.copytree(walk, place)
+    sorted(place.rglob("*.png"))[gone].write_bytes(b"no picture")
+    for _ in range(2):
+        find_cameras([place], SequenceSettings(camera="auto"), out)
+    assert asked == [place]

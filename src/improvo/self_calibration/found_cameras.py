@@ -15,7 +15,7 @@ from improvo.files import write_json, write_text
 from improvo.odometry.run import RunSummary
 from improvo.self_calibration.from_motion import CameraFromMotion, Told, camera_from_motion
 from improvo.self_calibration.settings import SelfCalibrationSettings
-from improvo.sequences.base import Recording, SequenceSettings
+from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
 from improvo.sequences.opening import open_recording
 from improvo.sequences.rates import AUTO, recording_name
 from improvo.untrusted.text import read_json_file
@@ -139,7 +139,7 @@ def _digest(recording: Recording) -> str:
     for index in sorted({0, len(recording) // 2, len(recording) - 1}):
         try:
             picture = recording.image(index)
-        except InputError:  # this frame is damaged
+        except (InputError, UnreadableFrameError):  # this frame is damaged or missing
             continue
         digest.update(str(picture.shape).encode() + picture.tobytes())
     return digest.hexdigest()
