@@ -21,8 +21,7 @@ class TruePath:
     """True camera centers, one row for each pose of the run, each segment aligned on its own (rotation, scale)."""
 
     centers: Float64  # (N, 3) in the world of the run, NaN where there is no truth
-    errors: Float64  # (N,) distance of the estimate, in the run's unit
-    ate_percent: float  # root mean square of the errors over the length of the true path
+    ate_percent: float  # as `improvo evaluate trajectory` says it: in the unit of the truth, all segments together
     segment: Int64  # (N,) of each pose
 
     def drawn(self) -> Float64:
@@ -55,7 +54,7 @@ def true_path(run: RunFolder) -> TruePath | None:
         return None
     rows = np.searchsorted(run.sequence.indices, np.array(run.source_index)[run.frame_indices])
     wanted = truth.camera_centers[np.minimum(rows, len(truth) - 1)]
-    centers, length = np.full_like(wanted, np.nan), 0.0
+    centers, squares, length = np.full_like(wanted, np.nan), [], 0.0
     known = np.isfinite(wanted).all(axis=1)
     for segment in np.unique(trajectory.segment).tolist():
         here = np.flatnonzero((trajectory.segment == segment) & known)
@@ -63,9 +62,12 @@ def true_path(run: RunFolder) -> TruePath | None:
         if len(here) < _FEWEST or np.ptp(wanted[here], axis=0).max() == 0 or np.ptp(estimate, axis=0).max() == 0:
             continue
         centers[here] = align_points(estimate, wanted[here], with_scale=True).apply(wanted[here])
+        # segments have units of their own, the truth has one
+        error = align_points(wanted[here], estimate, with_scale=True).apply(estimate) - wanted[here]
+        squares.append((error**2).sum(axis=1))
         # from one known place to the next, also where there is no truth between them
-        length += float(np.linalg.norm(np.diff(centers[here], axis=0), axis=1).sum())
-    errors = np.linalg.norm(trajectory.camera_centers - centers, axis=1)
-    if not np.isfinite(errors).any() or length == 0:
+        length += float(np.linalg.norm(np.diff(wanted[here], axis=0), axis=1).sum())
+    if not squares or length == 0:
         return None
-    return TruePath(centers, errors, 100.0 * float(np.sqrt(np.nanmean(errors**2))) / length, trajectory.segment)
+    rmse = float(np.sqrt(np.concatenate(squares).mean()))
+    return TruePath(centers, 100.0 * rmse / length, trajectory.segment)
