@@ -287,11 +287,13 @@ def refuse_unsure(result: CameraFromMotion, name: str, settings: SelfCalibration
             f"{name}: its motion does not tell its camera (the distortion found has no inverse); {_ADVICE}"
         )
     if not result.focal_deviation <= settings.max_focal_deviation:  # nor where it is NaN
-        raise InputError(
-            f"{name}: its motion leaves the focal length open: {result.camera.fx:.0f} px +- "
-            f"{100 * result.focal_deviation:.1f} %, where {100 * settings.max_focal_deviation:.0f} % is the limit "
-            f"(max_focal_deviation); {_ADVICE}"
-        )
+        found = "no focal length fits better than another"
+        if result.focal_deviation < 1:
+            found = (
+                f"{result.camera.fx:.0f} px +- {100 * result.focal_deviation:.1f} %, where "
+                f"{100 * settings.max_focal_deviation:.2g} % is the limit (max_focal_deviation)"
+            )
+        raise InputError(f"{name}: its motion leaves the focal length open: {found}; {_ADVICE}")
     if not result.rms <= settings.max_rms:
         raise InputError(
             f"{name}: no camera explains it: points miss their places by {result.rms:.1f} px; its zoom or focus "
