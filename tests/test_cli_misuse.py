@@ -24,6 +24,7 @@ from improvo.cli.main import main
 from improvo.cli.output import configured, next_step, notice, say, typed
 from improvo.errors import ConfigError
 from improvo.files import make_output_folder
+from improvo.report.rerun_viewer import RerunViewer
 from improvo.sequences import open_sequence
 from improvo.terminal import one_line, printable
 
@@ -252,6 +253,36 @@ def test_the_recording_of_a_run_is_not_replaced_by_a_picture_of_it(
 def test_an_output_whose_name_is_no_text(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = Path(os.fsdecode(os.fsencode(tmp_path) + b"/out\xff"))
     assert "the name is no text" in refused(("run", walk, "-o", out, *ORB, "--quiet"), capsys)
+
+
+@pytest.mark.parametrize(
+    ("output", "says"),
+    [("walk/camera.yaml/out", "camera.yaml is a file, not a folder"), ("dangling", "is a link to what is not there")],
+)
+def test_an_output_where_no_folder_can_be(
+    walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], output: str, says: str
+) -> None:
+    (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
+    (tmp_path / "walk").symlink_to(walk)
+    assert says in refused(("run", walk, "-o", tmp_path / output, *ORB, "--quiet"), capsys)
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_a_live_viewer_that_is_not_there_is_told_before_any_work(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is looked for beside this Python, too: a virtual environment need not be activated."""
+    pytest.importorskip("rerun")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "bin" / "python"))
+    command = ("run", walk, "-o", tmp_path / "out", *ORB, "--quiet", "--view")
+    assert "the live viewer: no program `rerun` is found" in refused(command, capsys)
+    assert not (tmp_path / "out").exists()
+    program = tmp_path / "bin" / "rerun"
+    program.parent.mkdir()
+    program.write_text("#!/bin/sh\nexit 3\n")
+    program.chmod(0o755)
+    RerunViewer()
 
 
 # --- names
