@@ -7,6 +7,7 @@ import os
 import shlex
 import subprocess
 import sys
+import threading
 import wave
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +25,7 @@ from improvo.cli.main import main
 from improvo.cli.output import configured, next_step, notice, say, typed
 from improvo.errors import ConfigError
 from improvo.files import make_output_folder
+from improvo.folder_lock import locked
 from improvo.report.rerun_viewer import RerunViewer
 from improvo.sequences import open_sequence
 from improvo.terminal import one_line, printable
@@ -283,6 +285,45 @@ def test_a_live_viewer_that_is_not_there_is_told_before_any_work(
     program.write_text("#!/bin/sh\nexit 3\n")
     program.chmod(0o755)
     RerunViewer()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("run", "{walk}", "-o", "{out}", *ORB),
+        ("label", "{walk}", "-o", "{out}", *ORB),
+        ("simulate", "-o", "{out}", "--frames", "3"),
+        ("export", "colmap", "{run}", "-o", "{out}"),
+        ("export", "nerfstudio", "{run}", "-o", "{out}"),
+        ("export", "features", "{walk}", "-o", "{out}", "--layout", "hloc", *ORB),
+    ],
+    ids=lambda words: "-".join(word for word in words[:2] if word.isalpha()),
+)
+def test_two_commands_at_once_on_one_folder(
+    words: tuple[str, ...], walk: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command, package in (("simulate", "mujoco"), ("features", "h5py")):
+        if command in words:
+            pytest.importorskip(package)
+    out = tmp_path / "out"
+    make_output_folder(out, " ".join(words[:2]) if words[0] == "export" else words[0])
+    holds, done = threading.Event(), threading.Event()
+
+    def other() -> None:
+        with locked(out):
+            holds.set()
+            done.wait()
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    holds.wait()
+    try:
+        told = refused((*(word.format(walk=walk, out=out, run=finished) for word in words), "--quiet"), capsys)
+    finally:
+        done.set()
+        thread.join()
+    assert "is at work there" in told
+    assert {path.name for path in out.iterdir()} <= {".improvo.json", "settings.yaml"}
 
 
 # --- names
