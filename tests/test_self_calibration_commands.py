@@ -308,3 +308,17 @@ def test_another_mask_under_the_same_name_is_another_search(
         assert cv2.imwrite(str(mask), picture)
         find_cameras([walk], settings, out)
     assert asked == [walk, walk]
+
+
+@pytest.mark.parametrize("gone", [0, 22, 44])
+def test_a_recording_with_a_damaged_frame_is_still_told_from_another(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gone: int
+) -> None:
+    asked = counted(monkeypatch)
+    out, place = tmp_path / "out", tmp_path / "frames"
+    out.mkdir()
+    shutil.copytree(walk, place)
+    sorted(place.rglob("*.png"))[gone].write_bytes(b"no picture")
+    for _ in range(2):
+        find_cameras([place], SequenceSettings(camera="auto"), out)
+    assert asked == [place]

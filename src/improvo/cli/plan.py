@@ -6,6 +6,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from improvo.cli.output import figures, say
+from improvo.terminal import counted
 
 if TYPE_CHECKING:
     from improvo.improvement.plan import ImprovePlan
@@ -51,7 +52,7 @@ def say_label_plan(plan: LabelPlan) -> None:
     figures(values, "")
 
 
-def say_improve_plan(plan: ImprovePlan, rounds: int) -> None:
+def say_improve_plan(plan: ImprovePlan) -> None:
     """For people."""
     once, needed = plan.once, plan.needed
     values = label_figures(once, plan.labelings)
@@ -60,7 +61,7 @@ def say_improve_plan(plan: ImprovePlan, rounds: int) -> None:
         f"second per core"
     )
     say(
-        f"labelling: {once.frames} frames, {plan.labelings:.2g} times in {rounds} round{'s' * (rounds != 1)}: "
+        f"labelling: {once.frames} frames, {plan.labelings:.2g} times in {counted(plan.rounds, 'round')}: "
         f"{duration(plan.labelings * once.core_seconds)} of one core"
     )
     times = ", ".join(f"{n}: {duration(plan.labelings * once.seconds(n))}" for n in useful_workers(once))

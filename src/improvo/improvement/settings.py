@@ -120,6 +120,8 @@ class ImproveSettings:
     # share of the way from the weights that a round starts from to those that the recipe `held` has trained from them,
     # which is gone: with most of what was learned here goes less of what was known of other places
     way: float = 0.8
+    # then, in all rounds but the first, of the way from the weights that the loop started from
+    later_way: float = 0.9
     metric: MetricSettings = field(default_factory=MetricSettings)  # of the recipe `metric`, and of that
     training: OdometryTrainingSettings = field(  # of the recipe `tracks`
         default_factory=lambda: OdometryTrainingSettings(
@@ -134,8 +136,9 @@ class ImproveSettings:
         for name in ("minutes", "steps_per_frame"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ConfigError(f"{name}={getattr(self, name):g}: must be 0 or more")
-        if not 0 < self.way <= 1:
-            raise ConfigError(f"way={self.way:g}: must be above 0 and at most 1")
+        for name in ("way", "later_way"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ConfigError(f"{name}={getattr(self, name):g}: must be above 0 and at most 1")
         if self.minutes and self.recipe != HELD:
             raise ConfigError("minutes: only the recipe `held` chooses its steps by time; give steps instead")
 

@@ -25,7 +25,6 @@ class TruePath:
     """
 
     centers: Float64  # (N, 3) in the world of the run, NaN where there is no truth
-    errors: Float64  # (N,) distance of the estimate, in the run's unit
     ate_percent: float  # root mean square distance over the length of the true path
     segment: Int64  # (N,) of each pose
 
@@ -71,5 +70,4 @@ def true_path(run: RunFolder) -> TruePath | None:
     for segment in aligned:
         assert segment.motion is not None
         centers[segment.rows] = segment.motion.inverse().apply(segment.truth[:, :3, 3])
-    errors = np.linalg.norm(trajectory.camera_centers - centers, axis=1)
-    return TruePath(centers, errors, total.ate_percent, trajectory.segment)
+    return TruePath(centers, total.ate_percent, trajectory.segment)

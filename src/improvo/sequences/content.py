@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
+from improvo.errors import InputError
 from improvo.sequences.base import Recording, UnreadableFrameError
 
 _SAMPLE = 1 << 20  # bytes at the beginning, in the middle and at the end of a file
@@ -29,7 +30,7 @@ def content_of(recording: Recording) -> str:
     for index in sorted({0, len(recording) // 2, len(recording) - 1} if len(recording) else ()):
         try:
             picture = recording.image(index)
-        except UnreadableFrameError:
+        except (InputError, UnreadableFrameError):  # this frame is damaged or missing
             continue
         digest.update(str(picture.shape).encode() + picture.tobytes())
     return digest.hexdigest()
