@@ -146,12 +146,13 @@ class RobustMapper(Mapper):
         if self._lens.factor != 1.0:
             self._events.focal_length(self._buffer[0].frame_index, self._lens.factor, "the segment is doubtful")
             self._judge.alarm(f"the focal length is about {self._lens.factor:.2f} times that of the camera as given")
+        if self._second_opinion.on_dropped(self._buffer) and self._contradicted:
+            self._contradicted -= 1
         if self._contradicted:
             maps = "a former map" if self._contradicted == 1 else f"each of {self._contradicted} former maps"
             words = f"{maps} of these frames was contradicted by {_TWO_VIEWS}"
             # one was worse than the map that followed; several in a row tell that these frames mislead
             self._judge.suspicion(words, self._contradicted if self._contradicted > 1 else 0)
-        self._second_opinion.on_dropped(self._buffer)
         self._result.begin_segment()
         self._result.give_up(each for each in self._buffer if each.cam_from_world is None)
         self._health = HealthCheck(self._camera, self._settings, self._descriptor_distance)
@@ -224,10 +225,7 @@ class RobustMapper(Mapper):
         """The map is wrong: a provisional one starts anew over all its frames, another one over its last frames."""
         contradicted = self._contradicted + (by == _TWO_VIEWS)
         if self._states.is_provisional:
-            if by == _TWO_VIEWS:
-                self._events.contradicted(view.frame_index, "the map is started anew", by)
-            else:
-                self._second_opinion.drop(self._provisional, by)
+            self._second_opinion.drop(self._provisional, by, poses_contradicted=by == _TWO_VIEWS)
             self._buffer = self._provisional
             self._clear()
             self._states.map_ended()
