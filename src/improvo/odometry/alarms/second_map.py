@@ -61,19 +61,24 @@ class SecondOpinion:
         self._descriptor_distance = descriptor_distance
         self._events = events
         self._dropped: _Dropped | None = None
+        self.undecided = False  # whether the last map that stays does so because the second had two motions
 
     def stands(self, views: Sequence[View], by: str) -> bool:
         """Whether a map that was contradicted stays, since one started anew explains the tracks no better.
+
+        It stays undecided, too, where the second could choose between two motions: so could the two views.
 
         Args:
             views: in temporal order, with the poses of the map; they stay as they are.
             by: what contradicted it.
         """
+        self.undecided = False
         copies = [view.unposed() for view in views]
         started = start_map(copies, self._camera, self._settings, self._descriptor_distance)
         if isinstance(started, InitFailure):
             if started.reason != TWO_MOTIONS:
                 return False
+            self.undecided = True
             found = "has two motions to choose from, so it stays"  # as the two views had that spoke against it
             self._events.checked_again(views[-1].frame_index, by, found)
             return True
