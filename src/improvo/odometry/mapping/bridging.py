@@ -1,8 +1,8 @@
 """Joining a new map with that of a segment that ended before, where the camera sees the same place again.
 
 Two views of the new map must find the former one, and agree on where it lies and how large it is, and the camera must
-have been able to come from there to here. The newest two that do so count, as long as nothing is final. Otherwise two segments with scales of their own stand side by side, placed by
-guess.
+have been able to come from there to here. The newest two that do so count, as long as nothing is final. Otherwise two
+segments with scales of their own stand side by side, placed by guess.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Bridging:
         return join
 
     def _believed(self, former: FormerMap, a: Sighting, b: Sighting, running: Sequence[View]) -> Join | None:
-        """The join by two sightings; None where they are not enough, or contradict each other or the camera's course."""
+        """The join by two sightings; None where they contradict each other or the camera's course."""
         join = _joined(former, a, b, self._max_error)
         if join is None or join.points < self._min_points:  # a place that looks alike has a few points, too
             return None
