@@ -58,9 +58,13 @@ def test_kept_shares_are_of_one_recording_one_run_its_pairs_and_the_content_of_t
 
 def test_one_pair_has_no_interval(judge: ModuleType) -> None:
     before, after = {"judge 30": [[0.5]]}, {"judge 30": [[0.55]]}
-    assert judge._gain(before, after, ["judge 30"], 0) == "+10.0 % (too few pairs for an interval)"
+    pairs = {"judge 30": np.stack([np.arange(10), np.arange(10) + 30], axis=1)}
+    assert (
+        judge._gain(before, after, ["judge 30"], 0, {"judge 30": pairs["judge 30"][:1]})
+        == "+10.0 % (too few pairs for an interval)"
+    )
     many = {"judge 30": 10 * [[0.5]]}, {"judge 30": 10 * [[0.55]]}
-    assert judge._gain(*many, ["judge 30"], 0) == "+10.0 % (+10.0 to +10.0)"
+    assert judge._gain(*many, ["judge 30"], 0, pairs) == "+10.0 % (+10.0 to +10.0)"
 
 
 def test_nothing_compared_is_not_unchanged(tmp_path: Path) -> None:

@@ -213,7 +213,7 @@ def sequence_fingerprint(source: SequenceSource, sequence: Sequence) -> dict[str
         "times": zlib.crc32(sequence.times.tobytes()),
         "first_image": first,
         "first_mask": mask,
-        "content": content_of(sequence.recording),
+        "content": content_of(sequence.recording) if settings is not None else "",
         "mask_content": mask_content(sequence.settings) if settings is not None else "",
         "settings": asdict(settings) if settings is not None else {},
     }
