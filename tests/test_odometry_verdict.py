@@ -59,7 +59,11 @@ def test_each_kind_of_evidence_can_make_a_segment_doubtful() -> None:
     words = [judge(slightly, SETTINGS, (), ("contradicted",), times).word for times in (1, 2)]
     assert words == [RIGHT, DOUBTFUL]
     told = judge(worse, SETTINGS, (), ("one map was contradicted",), 0)
-    assert (told.word, told.evidence[0]) == (RIGHT, "one map was contradicted")
+    assert (told.word, told.evidence[1]) == (RIGHT, "although one map was contradicted")  # what speaks for it is first
+    for share, words in ((0.004, "known to 0.4 %"), (0.06, "known to 6 %"), (0.2, "known to 20 % only")):
+        steps = np.array([[0.0] * 6, [share] * 6])
+        told = changed(error_percent=np.zeros(6), scale_steps=steps)
+        assert told.evidence[0].endswith(words)
     assert judge(None, SETTINGS).word == NOT_JUDGED
     assert judge(None, SETTINGS, ("two motions",)).word == DOUBTFUL
 
@@ -135,6 +139,7 @@ def test_joined_stretches_take_the_worse_verdict_and_name_the_scale_between_them
     both = joined(good, bad, 0.01)
     assert (both.word, both.error_percent) == (DOUBTFUL, bad.error_percent)
     assert both.evidence[-1] == "joined, scale ±1 %"
+    assert joined(both, good, 0.01).evidence == both.evidence
     assert joined(good, good, 0.04).error_percent == pytest.approx(2.0)
     assert joined(good, Verdict(NOT_JUDGED), 0.01).word == RIGHT
     zoomed = Verdict(DOUBTFUL, 0.5, 0.3, ("the focal length changed",))
@@ -154,6 +159,8 @@ def test_run_json_has_no_nan_and_tells_frames_and_lines() -> None:
         {"number": 0, "first": 0, "last": 9, "verdict": judge(GOOD, SETTINGS).report()},
         {"number": 1, "first": 10, "last": 30, "verdict": verdict.report()},
         {"number": 2, "first": 31, "last": 33},  # of a run before there were verdicts
+        {"number": 3, "first": 34, "last": 60, "frames": 20, "verdict": judge(GOOD, SETTINGS).report()},
+        {"number": 4, "first": 36, "last": 70, "frames": 9, "verdict": judge(GOOD, SETTINGS).report()},
     ]
     segment = np.array([0, 0, 1, 1, -1, 2])
     assert doubtful_frames({"segments": segments}, segment).tolist() == [False, False, True, True, False, False]
@@ -163,6 +170,8 @@ def test_run_json_has_no_nan_and_tells_frames_and_lines() -> None:
         "segment 0 (frames 0 to 9) is right",
         "segment 1 (frames 10 to 30) is doubtful",
         "segment 2 (frames 31 to 33) is not judged",
+        "segment 3 (frames 34 to 60) is right",
+        "segment 4 (9 of frames 36 to 70) is right",
     ]
     assert verdict_lines({"segments": segments}, only=DOUBTFUL) == lines[1:2]
 

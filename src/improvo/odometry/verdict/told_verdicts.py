@@ -58,6 +58,8 @@ def verdict_lines(report: Mapping[str, Any], only: str | None = None) -> list[st
             continue
         why = "; ".join(verdict["evidence"]) or "there is no verdict of it"
         frames = f"frames {each['first']} to {each['last']}"
+        if each.get("frames", np.inf) < (each["last"] - each["first"] + 1) / 2:  # others lie between
+            frames = f"{each['frames']} of {frames}"
         lines.append(f"segment {each['number']} ({frames}) is {verdict['word']}: {why}")
     return lines
 

@@ -79,11 +79,14 @@ def judge(
         alarms = (*alarms, of_lens[0])
     error = estimated_error(spread)
     uncertain = _uncertain(spread)
-    evidence = [*alarms, *suspicions, _in_words(spread, error)]
-    evidence += [words for words in of_lens[:1] if words not in alarms]
-    evidence += [f"frames {first} to {last}: the scale is not determined" for first, last in uncertain]
     limit = settings.max_error * _SUSPECTED ** (suspected if suspicions else 0)
     word = RIGHT if error <= limit and not alarms else DOUBTFUL
+    if word == RIGHT:  # what speaks for it comes first
+        evidence = [_in_words(spread, error), *(f"although {suspicion}" for suspicion in suspicions)]
+    else:
+        evidence = [*alarms, *suspicions, _in_words(spread, error)]
+    evidence += [words for words in of_lens[:1] if words not in alarms]
+    evidence += [f"frames {first} to {last}: the scale is not determined" for first, last in uncertain]
     return Verdict(word, error, spread.noise_px, tuple(evidence), uncertain)
 
 
@@ -98,11 +101,12 @@ def joined(first: Verdict, second: Verdict, scale_error: float) -> Verdict:
         return Verdict(known.word, known.error_percent, known.noise_px, known.evidence, known.uncertain)
     better, worse = sorted((first, second), key=lambda each: (each.word == DOUBTFUL, np.nan_to_num(each.error_percent)))
     alarms = better.evidence[:1] if better.word == DOUBTFUL else ()
+    evidence = dict.fromkeys((*worse.evidence, *alarms, f"joined, scale ±{100 * scale_error:.1g} %"))  # each once
     return Verdict(
         worse.word,
         float(np.nanmax([first.error_percent, second.error_percent, 50.0 * scale_error])),
         float(np.fmax(first.noise_px, second.noise_px)),
-        (*worse.evidence, *alarms, f"joined, scale ±{100 * scale_error:.1g} %"),
+        tuple(evidence),
         (*first.uncertain, *second.uncertain),
     )
 
@@ -178,7 +182,9 @@ def _in_words(spread: Spread, error: float) -> str:
     scale = float(_scale_errors(spread).max(initial=0.0))
     if _SCALE_SHARE * scale > float(np.linalg.norm(spread.error_percent)):
         first, last = spread.link_frames[int(np.argmax(_scale_errors(spread)))].tolist()
-        return words + f"the scale between frames {first} and {last} is known to {100 * scale:.0f} % only"
+        share = f"{100 * scale:.1g}" if scale < 0.01 else f"{100 * scale:.0f}"
+        only = " only" if scale >= SAME_SCALE else ""
+        return words + f"the scale between frames {first} and {last} is known to {share} %{only}"
     if quarters[worst] > 2.0 * halves.max():
         return words + f"{PARTS[worst]} quarter of the picture it differs by {quarters[worst]:.1f} %"
     return words + f"{HALVES[int(np.argmax(halves))]} alone differs by {halves.max():.1f} %"
