@@ -24,6 +24,8 @@ _SIGMAS_OF_GROWTH = 8.0  # its change within a window, which a step ahead imitat
 _RARE = 0.01  # share of windows that say so in right recordings; one of the hundreds of a long one is no alarm
 _LARGEST_LENS_ERROR = 0.06  # of the logarithm of a focal length; a window that knows it less well says nothing of it
 _SUSPECTED = 0.75  # of the error that a segment may have, where something speaks against it that right ones show, too
+_AS_WELL = 1.8  # error of a camera that only turns, over the map's: 1.2 to 1.6 where it did, 9 to 24 where it moved
+_MOVED = 0.03  # of the picture's width; what moves less is explained by any camera
 RIGHT, DOUBTFUL, NOT_JUDGED = "right", "doubtful", "not judged"
 
 
@@ -77,6 +79,7 @@ def judge(
     of_lens = _said_of_lens(spread)
     if len(of_lens) > _RARE * len(spread.lens):
         alarms = (*alarms, of_lens[0])
+    alarms = (*alarms, *_said_of_turning(spread))
     error = estimated_error(spread)
     uncertain = _uncertain(spread)
     limit = settings.max_error * _SUSPECTED ** (suspected if suspicions else 0)
@@ -153,6 +156,16 @@ def _said_of_lens(spread: Spread) -> tuple[str, ...]:
         if abs(change) > max(_FOCAL_CHANGE, _SIGMAS * float(np.hypot(a.offset_error, b.offset_error))):
             said.append(_told(a.frames[0], b.frames[1], f"changes by {100 * abs(np.expm1(change)):.0f} %"))
     return tuple(said)
+
+
+def _said_of_turning(spread: Spread) -> tuple[str, ...]:
+    """Whether the camera may have only turned, with another focal length than the one guessed."""
+    telling = [each for each in spread.turning if each.moved >= _MOVED]
+    turned = [each for each in telling if each.error_px <= _AS_WELL * each.map_px]
+    if not turned or len(turned) <= len(telling) / 2:
+        return ()
+    fov = float(np.median([each.fov for each in turned]))
+    return (f"a camera that only turns, {fov:.0f} degrees wide, explains it as well, and how wide it is was a guess",)
 
 
 def _told(first: int, last: int, words: str) -> str:
