@@ -290,7 +290,10 @@ def test_names_with_bars_stay_in_their_cell(tmp_path: Path) -> None:
 
 
 def test_a_true_path_with_gaps_is_as_long_as_it_is() -> None:
-    """Where every second frame has no truth, the error is a share of the whole path all the same."""
+    """Where every second frame has no truth, the error is a share of the whole path all the same.
+
+    It is the error that `improvo evaluate trajectory` gives.
+    """
     angle = np.linspace(0, 3, 60)
     true = np.stack([np.cos(angle), np.sin(angle), 0.1 * angle], axis=1)
     estimate = 0.5 * true + np.random.default_rng(0).normal(0, 0.004, true.shape)
@@ -312,6 +315,12 @@ def test_a_true_path_with_gaps_is_as_long_as_it_is() -> None:
         assert path is not None
         assert (np.isfinite(path.centers[:, 0]) == np.isfinite(poses[:, 0, 0])).all()
         found.append(path.ate_percent)
+        evaluated = evaluate_trajectory(run.trajectory, sequence.ground_truth)
+        assert evaluated.ate_percent == pytest.approx(path.ate_percent, rel=1e-12)
+        assert evaluated.ate_m is not None
+        scale = evaluated.segments[0].scale
+        distances = np.linalg.norm(path.centers - estimate, axis=1)
+        assert scale * np.sqrt(np.nanmean(distances**2)) == pytest.approx(evaluated.ate_m.rmse, rel=1e-9)
         drawn = np.isfinite(path.drawn()[:, 0])
         assert drawn[:59].all() if without.step == 2 else (drawn == np.isfinite(path.centers[:, 0])).all()
     np.testing.assert_allclose(found, 100 * 0.004 * np.sqrt(3) / 1.505, rtol=0.2)

@@ -293,12 +293,21 @@ def test_a_folder_that_holds_another_recording_by_now_is_looked_at_anew(
         assert cv2.imwrite(str(picture), cv2.imread(str(picture))[:, ::-1])
     find_cameras([place], SequenceSettings(camera="auto"), out)
     assert asked == [place, place]
-    side = out / "camera.json"
-    content = json.loads(side.read_text())
-    del content["request"]["pictures"]  # as it was written before
-    side.write_text(json.dumps(content))
-    find_cameras([place], SequenceSettings(camera="auto"), out)
-    assert asked == [place, place]
+
+
+def test_another_mask_under_the_same_name_is_another_search(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = counted(monkeypatch)
+    out, mask = tmp_path / "out", tmp_path / "mask.png"
+    out.mkdir()
+    settings = SequenceSettings(camera="auto", mask=str(mask))
+    for black in (0, 0, 40):
+        picture = np.full((240, 320), 255, np.uint8)
+        picture[:, :black] = 0
+        assert cv2.imwrite(str(mask), picture)
+        find_cameras([walk], settings, out)
+    assert asked == [walk, walk]
 
 
 @pytest.mark.parametrize("gone", [0, 22, 44])

@@ -22,7 +22,7 @@ from improvo.sequences.live_sequence import LiveSequence
 from improvo.sequences.sequence import Sequence, selected
 from improvo.sequences.video_codec import has_sound_alone
 from improvo.types import Trajectory
-from improvo.untrusted.paths import check_path
+from improvo.untrusted.paths import check_path, check_readable
 
 _LOOKED_AT, _NAMED = 200, 4  # entries of a folder that is no recording, and of those that are named
 ENTRY_POINT = "improvo.recordings"  # the group under which other packages offer their readers
@@ -82,7 +82,7 @@ def true_trajectory(path: Path | str, settings: SequenceSettings | None = None, 
 def open_recording(path: Path | str, settings: SequenceSettings | None = None, **overrides: Any) -> Recording:
     """The recording as it lies on disk: raw images, needs no calibration. Arguments and errors as `open_sequence`."""
     settings = _with_overrides(settings, overrides)
-    path = check_path(Path(path))
+    path = check_readable(check_path(Path(path)))
     if settings.fps is not None and not 1e-6 <= settings.fps <= 1e6:
         raise InputError(f"{path}: fps {settings.fps:g} is no number of frames a second; between 1e-06 and 1e+06")
     try:

@@ -35,6 +35,7 @@ _WINDOW = 12  # keyframes that are adjusted together from each part of the evide
 _FEW = 8  # observations or common points; fewer determine nothing
 _THIN = 6  # points seen on both sides of a gap between two keyframes; fewer carry no scale across it
 _UNKNOWN_SCALE = float(np.log(2.0))  # where no point is, the scale of what follows may as well be half or double
+_ROUNDING = 1e-12  # of coordinates, as a share of their size; positions that differ by less are one
 _HASH = 2654435761  # a multiplier of Knuth's, so that the halves of the points are no halves of time or place
 
 
@@ -52,6 +53,7 @@ class Spread:
         lens: what the windows say of the focal length.
         shared_px: of the residuals, what neighbours in the picture have in common (`shared_errors.py`).
         turning: what a camera that only turns says of the windows; empty where the focal length is no guess.
+        views_per_point: keyframes that observe a point, mean.
     """
 
     error_percent: Float64
@@ -62,6 +64,7 @@ class Spread:
     lens: tuple[LensMeasure, ...] = ()
     shared_px: float = 0.0
     turning: tuple[TurningCamera, ...] = ()
+    views_per_point: float = 1.0
 
 
 @dataclass
@@ -105,6 +108,8 @@ class EvidenceCheck:
         self._across: dict[int, int] = {}  # points on both sides of the gap after a keyframe, by any window
         self._errors: list[float] = []  # pixels, median of each window
         self._shared: list[float] = []  # pixels, of each window
+        self._observations = 0
+        self._is_seen = np.zeros(0, np.bool_)  # by map point
         self._scale_steps: list[Float64] = []
         self._links: list[tuple[int, int]] = []
         self._lens: list[LensMeasure] = []
@@ -125,6 +130,10 @@ class EvidenceCheck:
         self._pending.append(keyframe)
         self._centers.append(se3.inverse(cam_from_world)[:3, 3])
         self._frames.append(view.frame_index)
+        if len(xyz) > len(self._is_seen):
+            self._is_seen = np.concatenate([self._is_seen, np.zeros(len(xyz), np.bool_)])
+        self._is_seen[keyframe.points] = True
+        self._observations += len(keyframe.points)
         if len(self._pending) == _WINDOW:
             self._solve_window(xyz)
 
@@ -153,6 +162,7 @@ class EvidenceCheck:
             lens=tuple(self._lens),
             shared_px=float(np.median(self._shared)) if self._shared else 0.0,
             turning=tuple(self._turning),
+            views_per_point=self._observations / max(int(self._is_seen.sum()), 1),
         )
 
     def _mark_empty_gaps(self, centers: Float64) -> None:
@@ -197,9 +207,17 @@ class EvidenceCheck:
             path.world_from_cam = path.world_from_cam[-self._overlap :]
 
     def _masks(self, window: EvidenceWindow) -> list[Mask]:
-        """Which observations (O,) belong to each of PARTS."""
-        left = window.keypoints[:, 0] < 0.5 * self._camera.width
-        upper = window.keypoints[:, 1] < 0.5 * self._camera.height
+        """Which observations (O,) belong to each of PARTS.
+
+        A jackknife needs groups of the same size. Where half of a picture is bare, a quarter of its area can have most
+        of the evidence, and what is left without it tells little of the path. So each quarter has a quarter of the
+        observations: the picture is cut at their median, and each half of it at its own.
+        """
+        x, y = window.keypoints.T
+        left = x < np.median(x)
+        upper = np.zeros(len(y), np.bool_)
+        for side in (left, ~left):
+            upper[side] = y[side] < (np.median(y[side]) if side.any() else 0.0)
         half = ((window.ids[window.point] * _HASH) >> 7) & 1 == 0
         return [~(upper & left), ~(upper & ~left), ~(~upper & left), ~(~upper & ~left), half, ~half]
 
@@ -213,7 +231,13 @@ class EvidenceCheck:
 
 
 def error_percent(path: Float64, reference: Float64) -> float:
-    """Root mean square distance of positions (N, 3) after Sim3, as % of the reference's path."""
+    """Root mean square distance of positions (N, 3) after Sim3, as % of the reference's path.
+
+    Infinite where one of them stands still: Sim3 would shrink any path onto a reference on one spot, and be right.
+    """
+    size = float(np.abs(reference).max(initial=1.0))
+    if np.ptp(reference, axis=0).max() <= _ROUNDING * size:
+        return float("inf")
     length = np.linalg.norm(np.diff(reference, axis=0), axis=1).sum()
     try:
         aligned = align_points(reference, path, with_scale=True).apply(path)
