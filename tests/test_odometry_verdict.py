@@ -59,7 +59,11 @@ def test_each_kind_of_evidence_can_make_a_segment_doubtful() -> None:
     words = [judge(slightly, SETTINGS, (), ("contradicted",), times).word for times in (1, 2)]
     assert words == [RIGHT, DOUBTFUL]
     told = judge(worse, SETTINGS, (), ("one map was contradicted",), 0)
-    assert (told.word, told.evidence[0]) == (RIGHT, "one map was contradicted")
+    assert (told.word, told.evidence[1]) == (RIGHT, "although one map was contradicted")  # what speaks for it is first
+    for share, words in ((0.004, "known to 0.4 %"), (0.06, "known to 6 %"), (0.2, "known to 20 % only")):
+        steps = np.array([[0.0] * 6, [share] * 6])
+        told = changed(error_percent=np.zeros(6), scale_steps=steps)
+        assert told.evidence[0].endswith(words)
     assert judge(None, SETTINGS).word == NOT_JUDGED
     assert judge(None, SETTINGS, ("two motions",)).word == DOUBTFUL
 
@@ -154,7 +158,9 @@ def test_the_error_of_a_joined_stretch_counts_by_its_share_of_the_path() -> None
     long = joined(bad, good, 0.01, (9.0, 1.0))
     assert (long.word, long.evidence[0]) == (DOUBTFUL, bad.evidence[0])
     assert long.error_percent == pytest.approx(np.hypot(0.9 * bad.error_percent, 0.1 * good.error_percent))
-    assert joined(short, good, 0.01, (10.0, 0.0)).error_percent == pytest.approx(short.error_percent)
+    twice = joined(short, good, 0.01, (10.0, 0.0))
+    assert twice.error_percent == pytest.approx(short.error_percent)
+    assert sum(words.startswith("joined") for words in twice.evidence) == 1
 
 
 def test_joined_stretches_are_doubtful_by_their_scale_and_by_what_made_one_of_them_so() -> None:
@@ -182,6 +188,8 @@ def test_run_json_has_no_nan_and_tells_frames_and_lines() -> None:
         {"number": 0, "first": 0, "last": 9, "verdict": judge(GOOD, SETTINGS).report()},
         {"number": 1, "first": 10, "last": 30, "verdict": verdict.report()},
         {"number": 2, "first": 31, "last": 33},  # of a run before there were verdicts
+        {"number": 3, "first": 34, "last": 60, "frames": 20, "verdict": judge(GOOD, SETTINGS).report()},
+        {"number": 4, "first": 36, "last": 70, "frames": 9, "verdict": judge(GOOD, SETTINGS).report()},
     ]
     segment = np.array([0, 0, 1, 1, -1, 2])
     assert doubtful_frames({"segments": segments}, segment).tolist() == [False, False, True, True, False, False]
@@ -191,6 +199,8 @@ def test_run_json_has_no_nan_and_tells_frames_and_lines() -> None:
         "segment 0 (frames 0 to 9) is right",
         "segment 1 (frames 10 to 30) is doubtful",
         "segment 2 (frames 31 to 33) is not judged",
+        "segment 3 (frames 34 to 60) is right",
+        "segment 4 (9 of frames 36 to 70) is right",
     ]
     assert verdict_lines({"segments": segments}, only=DOUBTFUL) == lines[1:2]
 

@@ -41,8 +41,10 @@ class RobustMapper(Mapper):
         descriptor_distance: float,
         result: OdometryResult,
         events: EventLog,
+        camera_is_guess: bool = False,
     ) -> None:
         super().__init__(camera, settings, descriptor_distance, result, events)
+        self._camera_is_guess = camera_is_guess
         self._states = StateMachine()
         self._buffer: list[View] = []  # while INITIALISING: the initialisation buffer; while LOST: the lost frames
         self._cooldown = 0  # frames to wait before the next try to start
@@ -54,7 +56,7 @@ class RobustMapper(Mapper):
         self._second_opinion = SecondOpinion(camera, settings, descriptor_distance, events)
         self._window = SlidingWindow(settings.window, camera.width)
         self._health = HealthCheck(camera, settings, descriptor_distance)
-        self._judge = SegmentJudge(camera, settings)
+        self._judge = SegmentJudge(camera, settings, camera_is_guess)
         self._bridging = Bridging(settings)
         self._provisional: list[View] = []  # all views of a provisional map with a pose, in order; none is final
         self._attached = AttachedDetector(camera, settings, descriptor_distance)
@@ -312,7 +314,7 @@ class RobustMapper(Mapper):
     def _clear(self) -> None:
         """No map."""
         self._map = None
-        self._judge = SegmentJudge(self._camera, self._settings)
+        self._judge = SegmentJudge(self._camera, self._settings, self._camera_is_guess)
         self._window = SlidingWindow(self._settings.window, self._camera.width)
         self._provisional = []
         self._cooldown, self._costly_failures = 0, 0

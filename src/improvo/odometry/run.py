@@ -121,7 +121,12 @@ def run_odometry(
             colours.add(view)
 
         odometry = VisualOdometry(
-            frontend, sequence.camera, settings.odometry, settings.frontend.use_stability, on_final=final
+            frontend,
+            sequence.camera,
+            settings.odometry,
+            settings.frontend.use_stability,
+            on_final=final,
+            camera_is_guess=sequence.settings.camera_is_guess,
         )
         visualizer.begin(sequence.camera)
         try:

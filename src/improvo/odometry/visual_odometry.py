@@ -67,6 +67,8 @@ class VisualOdometry:
         settings: all numbers.
         use_stability: weigh observations with the frontend's stability (w_ij), or with 1.
         on_final: called with each frame that nothing can change any more.
+        camera_is_guess: the focal length is a guess. What a camera that only turns explains as well, with another
+            focal length, is doubtful then.
     """
 
     def __init__(
@@ -76,11 +78,13 @@ class VisualOdometry:
         settings: OdometrySettings | None = None,
         use_stability: bool = True,
         on_final: Callable[[FinalView], None] | None = None,
+        camera_is_guess: bool = False,
     ) -> None:
         self._detect = WorldKeypoints(frontend)
         self._camera = camera
         self._settings = settings or OdometrySettings()
         self._use_stability = use_stability
+        self._camera_is_guess = camera_is_guess
         self._refines = self._settings.mode == "robust" and _is_refined(frontend, self._settings.refinement)
         self._result = OdometryResult(camera, on_final)
         self._events = EventLog()
@@ -155,9 +159,9 @@ class VisualOdometry:
         if image is not None and self._refines:
             view.image = prepared(image)
         if self._mapper is None:
-            mapper: type[Mapper] = RobustMapper if self._settings.mode == "robust" else PaperMapper
-            distance = self._max_distance(matched.features)
-            self._mapper = mapper(self._camera, self._settings, distance, self._result, self._events)
+            about = self._camera, self._settings, self._max_distance(matched.features), self._result, self._events
+            robust = self._settings.mode == "robust"
+            self._mapper = RobustMapper(*about, self._camera_is_guess) if robust else PaperMapper(*about)
         self._mapper.track(view)
         self._newest = view
         self._detect.know(view.frame_index, self._mapper.dispensable_pixels(view))

@@ -34,6 +34,11 @@ class SequenceSettings:
     mask: str | None = None  # one image for all frames, or a folder with one per frame; only white pixels are used
     topic: str | None = None  # the image topic of a ROS bag, or the camera of a recording with several (cam1, image_3)
 
+    @property
+    def camera_is_guess(self) -> bool:
+        """Whether all that is known of the camera is a field of view, as a person guesses it."""
+        return self.camera is None and self.fov is not None
+
 
 class Recording(ABC):
     """One recording as stored on disk, with random access. A format is one file with one subclass.

@@ -23,6 +23,7 @@ from improvo.odometry.mapping.window import OBJECTIVE, SOLVER
 from improvo.odometry.verdict.evidence_window import EvidenceKeyframe, EvidenceWindow
 from improvo.odometry.verdict.lens_evidence import LensMeasure, measured_lens
 from improvo.odometry.verdict.shared_errors import shared_error
+from improvo.odometry.verdict.turning_camera import TurningCamera, turning_camera
 from improvo.odometry.view import Mask, View
 from improvo.types import Float64, Int64
 
@@ -51,6 +52,7 @@ class Spread:
         width: of the picture in pixels.
         lens: what the windows say of the focal length.
         shared_px: of the residuals, what neighbours in the picture have in common (`shared_errors.py`).
+        turning: what a camera that only turns says of the windows; empty where the focal length is no guess.
         views_per_point: keyframes that observe a point, mean.
     """
 
@@ -61,6 +63,7 @@ class Spread:
     width: int
     lens: tuple[LensMeasure, ...] = ()
     shared_px: float = 0.0
+    turning: tuple[TurningCamera, ...] = ()
     views_per_point: float = 1.0
 
 
@@ -90,10 +93,13 @@ class EvidenceCheck:
 
     Args:
         camera: pinhole camera of the views.
+        camera_is_guess: its focal length is a guess; whether the camera only turned is then asked, too.
     """
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, camera: Camera, camera_is_guess: bool = False) -> None:
         self._camera = camera
+        self._camera_is_guess = camera_is_guess
+        self._turning: list[TurningCamera] = []
         self._pending: list[EvidenceKeyframe] = []  # of the next window; those of the overlap are first
         self._overlap = 0
         self._paths = [_Path() for _ in PARTS]
@@ -155,6 +161,7 @@ class EvidenceCheck:
             width=self._camera.width,
             lens=tuple(self._lens),
             shared_px=float(np.median(self._shared)) if self._shared else 0.0,
+            turning=tuple(self._turning),
             views_per_point=self._observations / max(int(self._is_seen.sum()), 1),
         )
 
@@ -190,6 +197,9 @@ class EvidenceCheck:
             self._links.append(frames)
         if self._lens_due and len(keyframes) >= _FEW:
             self._lens.append(measured_lens(window, frames, self._camera))
+        if self._lens_due and self._camera_is_guess:
+            turning = turning_camera(window, self._camera)
+            self._turning += [turning] if turning is not None else []
         self._lens_due = not self._lens_due
         self._overlap = min(_WINDOW // 2, len(keyframes))
         self._pending = keyframes[len(keyframes) - self._overlap :]

@@ -16,11 +16,12 @@ class SegmentJudge:
     Args:
         camera: pinhole camera of the views.
         settings: of the odometry; `verdict` is used.
+        camera_is_guess: its focal length is a guess.
     """
 
-    def __init__(self, camera: Camera, settings: OdometrySettings) -> None:
+    def __init__(self, camera: Camera, settings: OdometrySettings, camera_is_guess: bool = False) -> None:
         self._settings = settings
-        self._evidence = EvidenceCheck(camera)
+        self._evidence = EvidenceCheck(camera, camera_is_guess)
         self._alarms: list[str] = []
         self._suspicions: list[str] = []
         self._suspected = 0

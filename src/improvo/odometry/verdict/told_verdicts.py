@@ -58,6 +58,8 @@ def verdict_lines(report: Mapping[str, Any], only: str | None = None) -> list[st
             continue
         why = "; ".join(verdict["evidence"]) or "there is no verdict of it"
         frames = f"frames {each['first']} to {each['last']}"
+        if each.get("frames", np.inf) < (each["last"] - each["first"] + 1) / 2:  # others lie between
+            frames = f"{each['frames']} of {frames}"
         lines.append(f"segment {each['number']} ({frames}) is {verdict['word']}: {why}")
     return lines
 
@@ -72,6 +74,8 @@ def what_doubt_means(report: Mapping[str, Any]) -> list[str]:
     if not doubted:
         return []
     lines = ["what is doubtful may be wrong, and makes no labels; look at it before you use it"]
+    if any("a camera that only turns" in line for line in doubted):
+        lines.append("find out how wide the lens sees (`improvo calibrate`), and give that by --camera or --fov")
     if any("the focal length" in line for line in doubted):
         lines.append(
             "if the lens zoomed, cut the recording there and give each part its own camera; if not, calibrate "

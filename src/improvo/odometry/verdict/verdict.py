@@ -25,6 +25,8 @@ _SIGMAS_OF_GROWTH = 8.0  # its change within a window, which a step ahead imitat
 _RARE = 0.01  # share of windows that say so in right recordings; one of the hundreds of a long one is no alarm
 _LARGEST_LENS_ERROR = 0.06  # of the logarithm of a focal length; a window that knows it less well says nothing of it
 _SUSPECTED = 0.75  # of the error that a segment may have, where something speaks against it that right ones show, too
+_AS_WELL = 1.8  # error of a camera that only turns, over the map's: 1.2 to 1.6 where it did, 9 to 24 where it moved
+_MOVED = 0.03  # of the picture's width; what moves less is explained by any camera
 RIGHT, DOUBTFUL, NOT_JUDGED = "right", "doubtful", "not judged"
 
 
@@ -80,13 +82,17 @@ def judge(
     of_lens = _said_of_lens(spread)
     if len(of_lens) > _RARE * len(spread.lens):
         alarms = (*alarms, of_lens[0])
+    alarms = (*alarms, *_said_of_turning(spread))
     error = estimated_error(spread)
     uncertain = _uncertain(spread)
-    evidence = [*alarms, *suspicions, _in_words(spread, error)]
-    evidence += [words for words in of_lens[:1] if words not in alarms]
-    evidence += [f"frames {first} to {last}: the scale is not determined" for first, last in uncertain]
     limit = settings.max_error * _SUSPECTED ** (suspected if suspicions else 0)
     word = RIGHT if error <= limit and not alarms else DOUBTFUL
+    if word == RIGHT:  # what speaks for it comes first
+        evidence = [_in_words(spread, error), *(f"although {suspicion}" for suspicion in suspicions)]
+    else:
+        evidence = [*alarms, *suspicions, _in_words(spread, error)]
+    evidence += [words for words in of_lens[:1] if words not in alarms]
+    evidence += [f"frames {first} to {last}: the scale is not determined" for first, last in uncertain]
     return Verdict(word, error, spread.noise_px, tuple(evidence), uncertain, float("nan") if alarms else limit)
 
 
@@ -120,7 +126,7 @@ def joined(first: Verdict, second: Verdict, scale_error: float, paths: tuple[flo
         error,
         float(np.fmax(first.noise_px, second.noise_px)),
         (
-            *worse.evidence,
+            *(words for words in worse.evidence if not words.startswith("joined, ")),  # the last one tells of all
             *(better.evidence[:1] if better.word == DOUBTFUL else ()),
             f"joined, scale ±{100 * scale_error:.1g} %: estimated error {error:.1f} % of both paths together",
         ),
@@ -175,6 +181,16 @@ def _said_of_lens(spread: Spread) -> tuple[str, ...]:
     return tuple(said)
 
 
+def _said_of_turning(spread: Spread) -> tuple[str, ...]:
+    """Whether the camera may have only turned, with another focal length than the one guessed."""
+    telling = [each for each in spread.turning if each.moved >= _MOVED]
+    turned = [each for each in telling if each.error_px <= _AS_WELL * each.map_px]
+    if not turned or len(turned) <= len(telling) / 2:
+        return ()
+    fov = float(np.median([each.fov for each in turned]))
+    return (f"a camera that only turns, {fov:.0f} degrees wide, explains it as well, and how wide it is was a guess",)
+
+
 def _told(first: int, last: int, words: str) -> str:
     return f"frames {first} to {last} fit best if the focal length {words}: a zoom, a wrong calibration, or a mover"
 
@@ -204,7 +220,9 @@ def _in_words(spread: Spread, error: float) -> str:
     scale = float(_scale_errors(spread).max(initial=0.0))
     if _SCALE_SHARE * scale > float(np.linalg.norm(spread.error_percent)):
         first, last = spread.link_frames[int(np.argmax(_scale_errors(spread)))].tolist()
-        return words + f"the scale between frames {first} and {last} is known to {100 * scale:.0f} % only"
+        share = f"{100 * scale:.1g}" if scale < 0.01 else f"{100 * scale:.0f}"
+        only = " only" if scale >= SAME_SCALE else ""
+        return words + f"the scale between frames {first} and {last} is known to {share} %{only}"
     if quarters[worst] > 2.0 * halves.max():
         return words + f"{PARTS[worst]} quarter of the picture it differs by {quarters[worst]:.1f} %"
     return words + f"{HALVES[int(np.argmax(halves))]} alone differs by {halves.max():.1f} %"
