@@ -8,8 +8,8 @@ the share of right matches (3 and 8 px) of the frames held back, by the referenc
 depth images where it has them, and their number; then, for each recording and gap, and all gaps together, the rank
 correlation (Spearman) of the two over the candidates.
 Candidates are the bundled weights, those given, and, without `--only`, sums and spoiled ones of `superpoint-small`.
-With `--only` it compares: every row with the first, with 95 % intervals (bootstrap over pairs), and the correlations of
-those given where there are ten and more.
+With `--only` it compares: every row with the first, with 95 % intervals (bootstrap over blocks of neighbouring pairs),
+and the correlations of those given where there are ten and more.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from improvo.evaluation.measures import PairGeometry, relative_motion, right_matches
-from improvo.evaluation.pose.self_truth import FixedRun, choose_pairs
+from improvo.evaluation.pose.self_truth import FixedRun, choose_pairs, overlapping
 from improvo.evaluation.statistics import Bootstrap
 from improvo.files import content_hash
 from improvo.frontend.registry import load_frontend
@@ -168,7 +168,7 @@ def _right(geometry: PairGeometry, a: Features, b: Features) -> list[float]:
     return [*(float(each.mean()) for each in right), *(float(each.sum()) for each in right)]
 
 
-def compared(found: dict[str, Shares], column: int) -> None:
+def compared(found: dict[str, Shares], column: int, pairs: dict[str, Int64]) -> None:
     """Every candidate against the first, by the judge and by truth: all gaps with the same weight, then each."""
     first, *others = found
     for name in others:
@@ -176,20 +176,22 @@ def compared(found: dict[str, Shares], column: int) -> None:
         for kind in ("judge", "truth"):
             gaps = [gap for gap in found[first] if gap.startswith(kind)]
             if gaps:
-                cells.append(
-                    f"{kind} {_gain(found[first], found[name], gaps, column)}: "
-                    + ", ".join(f"{gap.split()[1]} {_gain(found[first], found[name], [gap], column)}" for gap in gaps)
+                together, *single = (
+                    _gain(found[first], found[name], some, column, pairs) for some in (gaps, *([gap] for gap in gaps))
                 )
+                words = (f"{gap.split()[1]} {gain}" for gap, gain in zip(gaps, single, strict=True))
+                cells.append(f"{kind} {together}: {', '.join(words)}")
         what = "share" if column < len(LIMITS) else "number"
         print(f"| {name} | {what}, {LIMITS[column % len(LIMITS)]:g} px | " + " | ".join(cells) + " |")
 
 
-def _gain(before: Shares, after: Shares, gaps: list[str], column: int) -> str:
+def _gain(before: Shares, after: Shares, gaps: list[str], column: int, pairs: dict[str, Int64]) -> str:
     base = np.mean([np.mean([pair[column] for pair in before[gap]]) for gap in gaps])
     resampled, differences = [], []
     for number, gap in enumerate(gaps):
         difference = np.array(after[gap])[:, column] - np.array(before[gap])[:, column]
-        resampled.append(Bootstrap(len(difference), number, 1000, 0.95).means(difference))
+        block = overlapping(pairs[gap])
+        resampled.append(Bootstrap(len(difference), number, 1000, 0.95, block).means(difference))
         differences.append(difference.mean())
     gain = f"{100 * np.mean(differences) / base:+.1f} %"
     if min(len(before[gap]) for gap in gaps) < _FEWEST_PAIRS:
@@ -255,7 +257,7 @@ def main() -> None:
                 print(f"\n{chosen.name}: pairs " + ", ".join(f"{name}: {len(p)}" for name, p in chosen.pairs.items()))
                 if arguments.only:
                     for column in (1, 0, 3, 2):
-                        compared(found, column)
+                        compared(found, column, chosen.pairs)
                     correlations(found, set())
                     continue
                 print("| candidate | " + " | ".join(found[bundled[0]]) + " |")

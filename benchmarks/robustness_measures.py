@@ -19,7 +19,7 @@ from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import TrackingState
 from improvo.odometry.verdict.verdict import RIGHT as RIGHT_WORD
 from improvo.odometry.visual_odometry import VisualOdometry
-from improvo.types import Float64, Frame, Mask, Trajectory
+from improvo.types import Float64, Frame, Int64, Mask, Trajectory
 from robustness_clips import Clip
 
 RIGHT_PERCENT = 3.0  # of the segment's own path
@@ -28,11 +28,12 @@ RIGHT_ROTATION_DEG = 2.0  # over a second, or over a whole segment that is short
 RIGHT_TURNS, WRONG_TURNS = 0.1, 0.5  # share of a segment's frames that turn otherwise, of a right and of a wrong one
 MIN_FRAMES = 20  # of a segment, for it to count
 MIN_PATH = 0.02  # metres; without a path, an error has no share of it
+MIN_TRUE = 3  # frames of a segment with a true pose, for it to be compared
 DOUBTS = ("focal length",)  # events that say that the segment may be wrong
 # "Not judged" is neither a claim nor an alarm; a contradiction is one, of the segment as it was with the frames that
 # are taken from it then.
 _NO_DOUBTS = ("not judged", "contradicted")
-RIGHT, WRONG, NONE, IMPOSSIBLE, POSE_OF_NOTHING = "R", "w", ".", "x", "X"  # of a frame
+RIGHT, WRONG, NONE, IMPOSSIBLE, POSE_OF_NOTHING, UNKNOWN = "R", "w", ".", "x", "X", "?"  # of a frame
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,8 @@ class JudgedSegment:
     first: int
     last: int
     frames: int
-    path_m: float  # true
+    true_frames: int  # of these have a true pose
+    path_m: float  # true, over these
     error_percent: float | None  # ATE after Sim3 over the path; None where there is no path or no truth
     turned_wrong: float  # share of its frames whose turn over a second is wrong
     reason: str
@@ -57,6 +59,11 @@ class JudgedSegment:
         return self.frames >= MIN_FRAMES
 
     @property
+    def known(self) -> bool:
+        """Whether there is truth to compare it with."""
+        return self.true_frames >= MIN_TRUE
+
+    @property
     def near(self) -> bool:
         """Whether its positions are right."""
         return self.error_percent is not None and self.error_percent < RIGHT_PERCENT
@@ -68,7 +75,12 @@ class JudgedSegment:
 
     @property
     def wrong(self) -> bool:
-        """Whether its error is large, most of its turns are wrong, or it claims a path where there was none."""
+        """Whether its error is large, most of its turns are wrong, or it claims a path where there was none.
+
+        Where the truth is missing, nothing is known against it.
+        """
+        if not self.known:
+            return False
         return self.error_percent is None or self.error_percent > WRONG_PERCENT or self.turned_wrong > WRONG_TURNS
 
     @property
@@ -91,7 +103,7 @@ class Alarm:
 class Judged:
     """Everything about one run."""
 
-    frames: str  # a letter for each: right, wrong, none, impossible, or a pose of nothing
+    frames: str  # a letter for each: right, wrong, none, impossible, a pose of nothing, or of a segment without truth
     segments: list[JudgedSegment]
     alarms: list[Alarm]
     events: list[Event]
@@ -101,7 +113,7 @@ class Judged:
         """`right`, `marked`, `lost` or `SILENT`."""
         if any(segment.silent for segment in self.segments) or self.frames.count(POSE_OF_NOTHING) > 2:
             return "SILENT"
-        possible = len(self.frames) - self.frames.count(IMPOSSIBLE) - self.frames.count(POSE_OF_NOTHING)
+        possible = sum(letter not in (IMPOSSIBLE, POSE_OF_NOTHING, UNKNOWN) for letter in self.frames)
         if self.frames.count(RIGHT) >= 0.8 * max(possible, 1):
             return "right"
         if self.alarms or any(segment.doubt for segment in self.segments):
@@ -177,6 +189,7 @@ def _judged(
         segment.first,
         segment.last,
         segment.frames,
+        len(_compared(estimate, truth, segment.number)),
         path,
         error,
         round(_share(rotation_wrong, estimate, segment.number), 3),
@@ -189,10 +202,10 @@ def _judged(
 
 def _error_percent(estimate: Trajectory, truth: Trajectory, number: int) -> tuple[float, float | None]:
     """True path in metres, and the error after Sim3 in % of it."""
-    rows = np.flatnonzero(estimate.valid & truth.valid[: len(estimate)] & (estimate.segment == number))
+    rows = _compared(estimate, truth, number)
     centres = truth.camera_centers[rows]
     path = float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
-    if len(rows) < 3 or path < MIN_PATH:
+    if len(rows) < MIN_TRUE or path < MIN_PATH:
         return path, None
     try:
         motion = align(centres, estimate.camera_centers[rows], "sim3")
@@ -200,6 +213,11 @@ def _error_percent(estimate: Trajectory, truth: Trajectory, number: int) -> tupl
         return path, None
     distance = np.linalg.norm(motion.apply(estimate.camera_centers[rows]) - centres, axis=1)
     return path, 100.0 * float(np.sqrt((distance**2).mean())) / path
+
+
+def _compared(estimate: Trajectory, truth: Trajectory, number: int) -> Int64:
+    """Rows of a segment that have a pose and a true one."""
+    return np.flatnonzero(estimate.valid & truth.valid[: len(estimate)] & (estimate.segment == number))
 
 
 def _share(rotation_wrong: Mask, estimate: Trajectory, number: int) -> float:
@@ -211,12 +229,15 @@ def _share(rotation_wrong: Mask, estimate: Trajectory, number: int) -> float:
 def _frames(clip: Clip, estimate: Trajectory, rotation_wrong: Mask, segments: list[JudgedSegment]) -> str:
     """A letter for each frame."""
     right_segments = {segment.number for segment in segments if segment.near}
+    unknown_segments = {segment.number for segment in segments if not segment.known}
     letters = []
     for row, has_pose in enumerate(estimate.valid.tolist()):
         if not clip.trackable[row]:
             letters.append(POSE_OF_NOTHING if has_pose else IMPOSSIBLE)
         elif not has_pose:
             letters.append(NONE)
+        elif int(estimate.segment[row]) in unknown_segments:
+            letters.append(UNKNOWN)
         else:
             right = int(estimate.segment[row]) in right_segments and not rotation_wrong[row]
             letters.append(RIGHT if right else WRONG)

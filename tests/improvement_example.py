@@ -65,6 +65,7 @@ class FakeTraining:
                 "seen": seen,
                 "control": job.control,
                 "steps": job.steps,
+                "first": job.first,
             }
         )
         make_output_folder(output, "train held")
@@ -90,7 +91,9 @@ def noisy(noise: float, seed: int) -> Weights:
     return replace(weights, tensors=tensors)
 
 
-def run(output: Path, sequences: Sequence[Path], train: FakeTraining, rounds: int = 2, **options: Any) -> Improvement:
+def run(
+    output: Path, sequences: Sequence[Path], train: FakeTraining, rounds: int | None = 2, **options: Any
+) -> Improvement:
     """One run of the loop."""
     settings = options.pop("settings", SETTINGS)
     if settings.frontend.name == SPOILED:

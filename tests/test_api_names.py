@@ -66,6 +66,6 @@ def test_hints_install_this_distribution_and_extras_that_exist() -> None:
 
 def test_the_command_is_the_distribution() -> None:
     text = (ROOT / "pyproject.toml").read_text()
-    assert 'improvo = "improvo.cli.main:main"' in text
+    assert 'improvo = "improvo.__main__:main"' in text
     shown = subprocess.run([sys.executable, "-m", "improvo", "--version"], capture_output=True, text=True, check=True)
     assert shown.stdout.startswith("improvo ")

@@ -58,9 +58,13 @@ def test_kept_shares_are_of_one_recording_one_run_its_pairs_and_the_content_of_t
 
 def test_one_pair_has_no_interval(judge: ModuleType) -> None:
     before, after = {"judge 30": [[0.5]]}, {"judge 30": [[0.55]]}
-    assert judge._gain(before, after, ["judge 30"], 0) == "+10.0 % (too few pairs for an interval)"
+    pairs = {"judge 30": np.stack([np.arange(10), np.arange(10) + 30], axis=1)}
+    assert (
+        judge._gain(before, after, ["judge 30"], 0, {"judge 30": pairs["judge 30"][:1]})
+        == "+10.0 % (too few pairs for an interval)"
+    )
     many = {"judge 30": 10 * [[0.5]]}, {"judge 30": 10 * [[0.55]]}
-    assert judge._gain(*many, ["judge 30"], 0) == "+10.0 % (+10.0 to +10.0)"
+    assert judge._gain(*many, ["judge 30"], 0, pairs) == "+10.0 % (+10.0 to +10.0)"
 
 
 def test_nothing_compared_is_not_unchanged(tmp_path: Path) -> None:
@@ -79,3 +83,32 @@ def test_nothing_compared_is_not_unchanged(tmp_path: Path) -> None:
     assert "without results in either: " in fine.stdout
     assert compared("none", "none").returncode == 1
     assert compared("a", "none").returncode == 1
+
+
+@pytest.mark.parametrize(
+    ("truth", "is_wrong", "letters"),
+    [("all", False, "R" * 40), ("none", False, "?" * 40), ("other", True, "w" * 40), ("standing", True, "w" * 40)],
+)
+def test_where_the_truth_is_missing_nothing_is_wrong(
+    monkeypatch: pytest.MonkeyPatch, truth: str, is_wrong: bool, letters: str
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import robustness_measures as measures
+    from improvo.odometry.segments import Segment
+    from improvo.types import Trajectory
+
+    def path(x: Any, y: Any) -> Any:
+        poses = np.tile(np.eye(4), (40, 1, 1))
+        poses[:, :3, 3] = np.stack([x, y, 0 * x], axis=1)
+        return poses
+
+    times, turn = np.arange(40) / 30, np.linspace(0, 6, 40)
+    circle, line = path(np.cos(turn), np.sin(turn)), path(turn, 0 * turn)
+    estimate = Trajectory(times, circle, np.zeros(40, np.int64))
+    true = {"all": circle, "none": circle * np.nan, "other": line, "standing": 0 * line + np.eye(4)}
+    known = Trajectory(times, true[truth])
+    rotation_wrong = measures._rotation_wrong(estimate, known)
+    judged = measures._judged(Segment(0, 0, 39, 40, 0.3, "end"), estimate, known, rotation_wrong, [])
+    assert (judged.wrong, judged.right) == (is_wrong, truth == "all")
+    clip = SimpleNamespace(trackable=np.ones(40, bool))
+    assert measures._frames(clip, estimate, rotation_wrong, [judged]) == letters

@@ -199,3 +199,24 @@ def test_a_killed_run_resumes_to_the_same_labels(labelled: Path, walks: list[Pat
     assert main(command[3:]) == 0
     assert contents(out) == contents(labelled)
     assert not list(out.glob(".*.partial"))
+
+
+def test_labels_of_what_was_there_before_are_refused(
+    walks: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same path holds another recording by now."""
+    place, out = tmp_path / "take", tmp_path / "labels"
+    shutil.copytree(walks[0], place)
+    command = ["label", str(place), "-o", str(out), *OPTIONS]
+    assert main(command) == 0
+    assert main(command) == 0
+    shutil.rmtree(place)
+    shutil.copytree(walks[1], place)
+    before = (out / "take" / "points.parquet").read_bytes()
+    capsys.readouterr()
+    assert main(command) == 2
+    assert f"{place}: is not what {out / 'take'} was made from, it has changed since" in capsys.readouterr().err
+    assert (out / "take" / "points.parquet").read_bytes() == before
+    shutil.rmtree(out / "take")
+    assert main(command) == 0
+    assert (out / "take" / "points.parquet").read_bytes() != before

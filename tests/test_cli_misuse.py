@@ -7,6 +7,7 @@ import os
 import shlex
 import subprocess
 import sys
+import threading
 import wave
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +24,9 @@ from improvo.cli.config import SETTINGS
 from improvo.cli.main import main
 from improvo.cli.output import configured, next_step, notice, say, typed
 from improvo.errors import ConfigError
+from improvo.files import make_output_folder
+from improvo.folder_lock import locked
+from improvo.report.rerun_viewer import RerunViewer
 from improvo.sequences import open_sequence
 from improvo.terminal import one_line, printable
 
@@ -253,6 +257,75 @@ def test_an_output_whose_name_is_no_text(walk: Path, tmp_path: Path, capsys: pyt
     assert "the name is no text" in refused(("run", walk, "-o", out, *ORB, "--quiet"), capsys)
 
 
+@pytest.mark.parametrize(
+    ("output", "says"),
+    [("walk/camera.yaml/out", "camera.yaml is a file, not a folder"), ("dangling", "is a link to what is not there")],
+)
+def test_an_output_where_no_folder_can_be(
+    walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], output: str, says: str
+) -> None:
+    (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
+    (tmp_path / "walk").symlink_to(walk)
+    assert says in refused(("run", walk, "-o", tmp_path / output, *ORB, "--quiet"), capsys)
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_a_live_viewer_that_is_not_there_is_told_before_any_work(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is looked for beside this Python, too: a virtual environment need not be activated."""
+    pytest.importorskip("rerun")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "bin" / "python"))
+    command = ("run", walk, "-o", tmp_path / "out", *ORB, "--quiet", "--view")
+    assert "the live viewer: no program `rerun` is found" in refused(command, capsys)
+    assert not (tmp_path / "out").exists()
+    program = tmp_path / "bin" / "rerun"
+    program.parent.mkdir()
+    program.write_text("#!/bin/sh\nexit 3\n")
+    program.chmod(0o755)
+    RerunViewer()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("run", "{walk}", "-o", "{out}", *ORB),
+        ("label", "{walk}", "-o", "{out}", *ORB),
+        ("simulate", "-o", "{out}", "--frames", "3"),
+        ("export", "colmap", "{run}", "-o", "{out}"),
+        ("export", "nerfstudio", "{run}", "-o", "{out}"),
+        ("export", "features", "{walk}", "-o", "{out}", "--layout", "hloc", *ORB),
+    ],
+    ids=lambda words: "-".join(word for word in words[:2] if word.isalpha()),
+)
+def test_two_commands_at_once_on_one_folder(
+    words: tuple[str, ...], walk: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command, package in (("simulate", "mujoco"), ("features", "h5py")):
+        if command in words:
+            pytest.importorskip(package)
+    out = tmp_path / "out"
+    make_output_folder(out, " ".join(words[:2]) if words[0] == "export" else words[0])
+    holds, done = threading.Event(), threading.Event()
+
+    def other() -> None:
+        with locked(out):
+            holds.set()
+            done.wait()
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    holds.wait()
+    try:
+        told = refused((*(word.format(walk=walk, out=out, run=finished) for word in words), "--quiet"), capsys)
+    finally:
+        done.set()
+        thread.join()
+    assert "is at work there" in told
+    assert {path.name for path in out.iterdir()} <= {".improvo.json", "settings.yaml"}
+
+
 # --- names
 
 
@@ -292,6 +365,43 @@ def test_a_folder_that_may_not_be_looked_into_is_one_line(
     assert message.startswith(f"improvo: {secret / 'deep'}")
     assert message.count("\n") == 1
     assert "ermission" in message
+
+
+@pytest.mark.parametrize(
+    ("words", "secret"),
+    [
+        (("info", "{video}"), "{video}"),
+        (("info", "{walk}"), "{walk}"),
+        (("run", "{walk}", "-o", "{new}", "--frontend", "{weights}"), "{weights}"),
+        (("weights", "show", "{weights}"), "{weights}"),
+        (("report", "{run}"), "{run}/run.json"),
+        (("label", "{walk}", "-o", "{store}", *ORB), "{store}/settings.yaml"),
+    ],
+    ids=lambda words: "-".join(words[:2]).replace("{", "").replace("}", "") if isinstance(words, tuple) else "",
+)
+def test_what_may_not_be_read_is_neither_damaged_nor_missing(
+    words: tuple[str, ...],
+    secret: str,
+    walk: Path,
+    video: Path,
+    finished: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    store, weights = tmp_path / "store", tmp_path / "own.safetensors"
+    make_output_folder(store, "label")
+    (store / "settings.yaml").write_text("frontend: {name: orb}\n")
+    weights.write_bytes(b"not looked at")
+    names = {"video": video, "walk": walk, "run": finished, "new": tmp_path / "new", "store": store, "weights": weights}
+    locked, may = secret.format(**names), os.access
+
+    def access(path: Any, mode: int) -> bool:
+        return os.fspath(path) != locked and may(path, mode)
+
+    monkeypatch.setattr(os, "access", access)  # root may read everything
+    told = refused(tuple(word.format(**names) for word in words), capsys)
+    assert f"{locked}: no permission to read it; choose another, or change that" in told
 
 
 def test_the_next_command_can_be_pasted_whatever_the_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

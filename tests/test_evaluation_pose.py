@@ -87,6 +87,22 @@ def test_bootstrap_intervals_have_the_width_of_a_share() -> None:
     assert high - low == pytest.approx(2 * 1.96 * np.sqrt(0.3 * 0.7 / 400), rel=0.1)
 
 
+def test_trials_that_are_like_their_neighbours_make_the_interval_wide() -> None:
+    """Of 20 runs of 20 equal trials only 20 are independent; where none is like the next, blocks change little."""
+    rng = np.random.default_rng(0)
+    alike, independent = np.repeat(rng.normal(size=20), 20), rng.normal(size=400)
+
+    def width(values: np.ndarray, block: int) -> float:
+        low, high = Bootstrap(400, seed=1, resamples=4000, block=block).interval(values)
+        assert low < values.mean() < high
+        return high - low
+
+    assert width(alike, 1) == pytest.approx(3.92 * alike.std() / np.sqrt(400), rel=0.05)
+    assert width(alike, 40) == pytest.approx(3.92 * alike.std() / np.sqrt(20), rel=0.25)
+    assert width(independent, 20) == pytest.approx(width(independent, 1), rel=0.2)
+    assert np.ptp(Bootstrap(50, seed=0, block=7).means(np.ones(50))) < 1e-6
+
+
 @pytest.mark.parametrize("sampling", ["bilinear", "nearest"])
 def test_depth_is_dropped_at_holes_edges_and_outside(sampling: str) -> None:
     depth = np.full((20, 30), 2.0, np.float32)

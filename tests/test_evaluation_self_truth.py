@@ -17,6 +17,7 @@ from improvo.evaluation.pose.self_truth import (
     choose_pairs,
     compare,
     compare_gaps,
+    overlapping,
     score_pairs,
 )
 from improvo.types import Float32
@@ -122,3 +123,14 @@ def test_unknown_depth_counts_for_nobody_and_few_matches_for_none_right() -> Non
     assert scores(run, settings=many).means()["right_8px"] == 0.0
     with pytest.raises(ConfigError):
         SelfTruthSettings(shuffles=0)
+
+
+@pytest.mark.parametrize(
+    ("count", "gap", "spacing", "together"),
+    [(100, 30, 10, 3), (100, 30, 1, 13), (100, 5, 10, 1), (6, 30, 1, 1), (1, 30, 1, 1), (0, 30, 1, 1)],
+)
+def test_pairs_that_look_at_the_same_frames_are_drawn_together(
+    count: int, gap: int, spacing: int, together: int
+) -> None:
+    first = spacing * np.arange(count)
+    assert overlapping(np.stack([first, first + gap], axis=1)) == together

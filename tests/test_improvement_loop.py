@@ -173,14 +173,58 @@ def test_the_control_is_judged_like_a_round_and_never_kept(walk: Path, tmp_path:
     assert [call["steps"] for call in training.calls] == [0, 3]  # as many as the round took
     assert result.control is not None
     control, validation = result.control
-    assert control.weights == out / "control" / "weights.safetensors"
+    assert control.weights == out / "control-1" / "weights.safetensors"
     assert [scores.pairs for scores in validation.scores] == [scores.pairs for scores in result.validations[0].scores]
     assert result.candidates[result.best].name == "round 1"
     assert any(line.startswith("control: ") and not line.endswith("kept") for line in lines)
-    assert "The control, trained for as many steps" in (out / "report.html").read_text()
+    assert "The control, trained for as many rounds and steps" in (out / "report.html").read_text()
     again = FakeTraining()
     assert run(out, [walk], again, rounds=1, settings=SETTINGS).control is None  # it may be left out or added
     assert again.calls == []
+
+
+def test_the_control_has_as_many_rounds_and_steps_as_what_is_kept(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    verdicts = iter([True, True, False])
+    monkeypatch.setattr("improvo.improvement.improve.is_better", lambda *_: next(verdicts))
+    training, out = FakeTraining((0.0,)), tmp_path / "out"
+    settings = replace(SETTINGS, control=True)
+    result = run(out, [walk], training, rounds=3, settings=settings)
+    assert result.kept == (1, 2)  # and the third was refused
+    assert [call["control"] for call in training.calls] == [False] * 3 + [True] * 2
+    assert [call["steps"] for call in training.calls[3:]] == [3, 3]  # those of either round
+    assert [call["seed"] for call in training.calls[3:]] == [0, 1]
+    start = result.candidates[0]
+    assert [call["start"] for call in training.calls[3:]] == [start.weights, out / "control-1" / "weights.safetensors"]
+    # every later one, control or not, goes back towards the start
+    assert [call["first"] for call in training.calls] == [None, start.weights, start.weights, None, start.weights]
+    assert result.control is not None
+    assert result.control[0].name == "control, 2 rounds"
+    assert not (out / "control-1" / "judgement.json").exists()
+
+
+def test_by_itself_the_loop_ends_with_the_first_round_that_is_not_better(walk: Path, tmp_path: Path) -> None:
+    training, lines = FakeTraining((0.5,)), list[str]()
+    out = tmp_path / "out"
+    result = run(out, [walk], training, rounds=None, progress=ImprovementProgress(lines.append))
+    assert [candidate.name for candidate in result.candidates] == ["start", "round 1"]
+    assert result.kept == ()
+    assert any(line.startswith("estimate: ") and line.endswith("a round, up to 2 rounds") for line in lines)
+    assert lines[-1] == "no further round, since the last was not better; --rounds 2 tries once more"
+    again = FakeTraining()
+    assert run(out, [walk], again, rounds=None).kept == ()
+    assert again.calls == []
+    assert run(out, [walk], FakeTraining((0.5, 0.0)), rounds=2).kept == (2,)  # asked for, it tries
+    assert run(out, [walk], again, rounds=None).kept == (2,)  # and all of it is read again
+    assert again.calls == []
+
+
+def test_by_itself_it_makes_two_rounds_where_the_first_is_better(
+    walk: Path, finished: tuple[Improvement, FakeTraining, list[str]], tmp_path: Path
+) -> None:
+    assert len(run(tmp_path / "out", [walk], FakeTraining(), rounds=None).candidates) == 3
+    assert results(tmp_path / "out") == results(finished[0].weights.parent)
 
 
 def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(walk: Path, tmp_path: Path) -> None:

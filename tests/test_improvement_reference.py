@@ -17,8 +17,9 @@ from improvo.errors import ImprovoError, InputError, OutputError
 from improvo.evaluation.pose.self_truth import FixedRun
 from improvo.frontend.settings import FrontendSettings
 from improvo.geometry.camera import Camera
-from improvo.improvement.estimate import Costs, estimate, refuse_full_disk
+from improvo.improvement.estimate import Costs, Estimate, estimate, refuse_full_disk
 from improvo.improvement.gaps import choose_gaps, median_overlap
+from improvo.improvement.plan import usual_rounds
 from improvo.improvement.recipe import steps_of
 from improvo.improvement.reference import (
     HELD_BACK,
@@ -170,6 +171,36 @@ def test_every_labelling_is_in_the_estimate(changes: dict[str, Any], rounds: int
     settings = replace(ImproveSettings(), **{"control": False, **changes})
     costs = Costs.usual(640 * 480, 300_000)
     assert estimate(settings, rounds, 800, 200, 640 * 480, costs, recordings).labeled_frames == frames
+
+
+@pytest.mark.parametrize(
+    ("first", "each", "rounds"),
+    [(3, 2, 2), (20, 8, 2), (20, 11, 1), (29, 9, 2), (29, 16, 1), (60, 29, 2), (60, 31, 1)],  # of minutes
+)
+def test_rounds_that_are_not_asked_for_take_half_an_hour_or_add_half_to_the_first(
+    first: float, each: float, rounds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    controls = []
+
+    def said(sequences: object, settings: ImproveSettings, number: int, evaluate: object) -> Estimate:
+        controls.append(settings.control)
+        return Estimate(first + (number - 1) * each, 0, 0, 0, 0, 0)
+
+    monkeypatch.setattr("improvo.improvement.plan.first_estimate", said)
+    assert usual_rounds([], replace(ImproveSettings(), control=True)) == rounds
+    assert not any(controls)  # which may be added later
+    monkeypatch.setattr("improvo.improvement.plan.first_estimate", lambda *_: None)
+    assert usual_rounds([], ImproveSettings()) == 1  # nothing can be read, which will be said
+
+
+def test_a_control_has_as_many_rounds() -> None:
+    settings, costs = ImproveSettings(), Costs.usual(640 * 480, 300_000)
+
+    def minutes(rounds: int, control: bool) -> float:
+        return estimate(replace(settings, control=control), rounds, 480, 120, 640 * 480, costs).minutes
+
+    added = [minutes(rounds, True) - minutes(rounds, False) for rounds in (1, 2, 3)]
+    assert 0 < added[1] - added[0] == pytest.approx(added[2] - added[1])
 
 
 def test_the_estimate_grows_with_the_work_and_a_full_disk_is_said_before_it(

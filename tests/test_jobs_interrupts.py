@@ -9,6 +9,7 @@ import sys
 
 import pytest
 
+from improvo.__main__ import main as command
 from improvo.cli.main import main
 from improvo.jobs.interrupts import interrupts_wait, termination_interrupts
 
@@ -47,6 +48,7 @@ def test_termination_is_an_interrupt_after_colmap_was_loaded_too() -> None:
     program = """
 import os, signal
 from improvo.evaluation.truth.structure_from_motion import load_pycolmap
+from improvo.__main__ import main as command
 from improvo.cli.main import main
 from improvo.jobs.interrupts import termination_interrupts
 try:
@@ -119,3 +121,17 @@ def test_another_error_of_compiled_code_stays_one(monkeypatch, tmp_path) -> None
     monkeypatch.setattr("improvo.cli.info.run", compiled)
     with pytest.raises(SystemError):
         main(["info", str(tmp_path)])
+
+
+def test_an_interrupt_while_the_command_line_is_loaded_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Interrupted:
+        def find_spec(self, name: str, *_: object) -> None:
+            if name == "improvo.cli.main":
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "meta_path", [Interrupted(), *sys.meta_path])
+    monkeypatch.delitem(sys.modules, "improvo.cli.main", raising=False)
+    assert command() == 130
+    assert capsys.readouterr().err == "improvo: interrupted\n"

@@ -194,3 +194,17 @@ def test_a_path_that_is_another_only_in_place_and_scale_has_no_error() -> None:
     assert error_percent(3.0 * path + (1.0, 2.0, 3.0), path) < 1e-9
     bent = path + np.linspace(0.0, 1.0, KEYFRAMES)[:, None] ** 2 * (0.0, 1.0, 0.0)
     assert error_percent(bent, path) > 0.5
+
+
+@pytest.mark.parametrize("where", [0.0, 3.0, 1e5])
+def test_a_path_against_one_that_stands_still_has_no_small_error(where: float) -> None:
+    """Sim3 shrinks any path onto one spot, where it is off by nothing: that is no agreement."""
+    path = se3.inverse(TRUTH)[:, :3, 3]
+    still = np.full_like(path, where) + 1e-16 * path
+    assert error_percent(path, still) == error_percent(still, path) == error_percent(still, still) == np.inf
+    spread = spread_of(np.broadcast_to(TRUTH[0], (4, 4, 4)), room().points)
+    assert np.isinf(spread.error_percent).all()
+    verdict = judge(spread, VerdictSettings())
+    assert verdict.word == DOUBTFUL
+    assert any("stays on one spot" in words for words in verdict.evidence)
+    assert verdict.report()["error_percent"] is None

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from improvo.cli.main import main
+from improvo.evaluation.trajectory.protocol import evaluate_trajectory
 from improvo.files import write_png
 from improvo.report.charts import line_chart
 from improvo.report.improvement_page import Measure, Round, write_improvement_page
@@ -289,7 +290,10 @@ def test_names_with_bars_stay_in_their_cell(tmp_path: Path) -> None:
 
 
 def test_a_true_path_with_gaps_is_as_long_as_it_is() -> None:
-    """Where every second frame has no truth, the error is a share of the whole path all the same."""
+    """Where every second frame has no truth, the error is a share of the whole path all the same.
+
+    It is the error that `improvo evaluate trajectory` gives.
+    """
     angle = np.linspace(0, 3, 60)
     true = np.stack([np.cos(angle), np.sin(angle), 0.1 * angle], axis=1)
     estimate = 0.5 * true + np.random.default_rng(0).normal(0, 0.004, true.shape)
@@ -309,11 +313,37 @@ def test_a_true_path_with_gaps_is_as_long_as_it_is() -> None:
         )
         path = true_path(run)  # type: ignore[arg-type]
         assert path is not None
-        assert (np.isfinite(path.errors) == np.isfinite(poses[:, 0, 0])).all()
+        assert (np.isfinite(path.centers[:, 0]) == np.isfinite(poses[:, 0, 0])).all()
         found.append(path.ate_percent)
+        evaluated = evaluate_trajectory(run.trajectory, sequence.ground_truth)
+        assert evaluated.ate_percent == pytest.approx(path.ate_percent, rel=1e-12)
+        assert evaluated.ate_m is not None
+        scale = evaluated.segments[0].scale
+        distances = np.linalg.norm(path.centers - estimate, axis=1)
+        assert scale * np.sqrt(np.nanmean(distances**2)) == pytest.approx(evaluated.ate_m.rmse, rel=1e-9)
         drawn = np.isfinite(path.drawn()[:, 0])
-        assert drawn[:59].all() if without.step == 2 else (drawn == np.isfinite(path.errors)).all()
+        assert drawn[:59].all() if without.step == 2 else (drawn == np.isfinite(path.centers[:, 0])).all()
     np.testing.assert_allclose(found, 100 * 0.004 * np.sqrt(3) / 1.505, rtol=0.2)
+
+
+def test_the_error_of_segments_with_units_of_their_own_is_that_of_the_evaluation() -> None:
+    """Errors are told in the unit of the truth, or a segment with large units would count for more."""
+    angle = np.linspace(0, 3, 60)
+    poses, estimated = np.tile(np.eye(4), (60, 1, 1)), np.tile(np.eye(4), (60, 1, 1))
+    poses[:, :3, 3] = np.stack([np.cos(angle), np.sin(angle), 0.1 * angle], axis=1)
+    off = np.random.default_rng(0).normal(0, 1, (60, 3)) * np.where(np.arange(60) < 30, 0.02, 0.001)[:, None]
+    segment = (np.arange(60) >= 30).astype(np.int64)
+    estimated[:, :3, 3] = np.where(segment == 0, 0.2, 5.0)[:, None] * (poses[:, :3, 3] + off)
+    truth, estimate = Trajectory(np.arange(60.0), poses), Trajectory(np.arange(60.0), estimated, segment)
+    run = SimpleNamespace(
+        trajectory=estimate,
+        sequence=SimpleNamespace(ground_truth=truth, indices=np.arange(60)),
+        source_index=list(range(60)),
+        frame_indices=np.arange(60),
+    )
+    path = true_path(run)  # type: ignore[arg-type]
+    assert path is not None
+    assert path.ate_percent == pytest.approx(evaluate_trajectory(estimate, truth).ate_percent)
 
 
 def test_chart_shows_a_value_that_stands_alone() -> None:

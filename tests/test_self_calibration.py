@@ -245,6 +245,12 @@ def test_motions_that_do_not_tell_the_camera_are_refused(motion: Float64, world:
     [
         ({"fov": float("nan")}, "the distortion found has no inverse"),
         ({"deviations": dict.fromkeys(NAMES, float("nan"))}, "leaves the focal length open"),
+        ({"deviations": dict.fromkeys(NAMES, float("inf"))}, "open: no focal length fits better than another; walk"),
+        (
+            {"deviations": dict.fromkeys(NAMES, 0.05 * SMALL.camera.fx)},
+            r"px \+- 5\.0 %, where 1 % is .*; --fov \d+ takes",
+        ),
+        ({"deviations": dict.fromkeys(NAMES, 0.2 * SMALL.camera.fx)}, r"px \+- 20\.0 %, where 1 % is .*\); walk"),
         ({"rms": float("nan")}, "no camera explains it"),
     ],
 )

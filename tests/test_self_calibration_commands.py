@@ -293,9 +293,32 @@ def test_a_folder_that_holds_another_recording_by_now_is_looked_at_anew(
         assert cv2.imwrite(str(picture), cv2.imread(str(picture))[:, ::-1])
     find_cameras([place], SequenceSettings(camera="auto"), out)
     assert asked == [place, place]
-    side = out / "camera.json"
-    content = json.loads(side.read_text())
-    del content["request"]["pictures"]  # as it was written before
-    side.write_text(json.dumps(content))
-    find_cameras([place], SequenceSettings(camera="auto"), out)
-    assert asked == [place, place]
+
+
+def test_another_mask_under_the_same_name_is_another_search(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = counted(monkeypatch)
+    out, mask = tmp_path / "out", tmp_path / "mask.png"
+    out.mkdir()
+    settings = SequenceSettings(camera="auto", mask=str(mask))
+    for black in (0, 0, 40):
+        picture = np.full((240, 320), 255, np.uint8)
+        picture[:, :black] = 0
+        assert cv2.imwrite(str(mask), picture)
+        find_cameras([walk], settings, out)
+    assert asked == [walk, walk]
+
+
+@pytest.mark.parametrize("gone", [0, 22, 44])
+def test_a_recording_with_a_damaged_frame_is_still_told_from_another(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gone: int
+) -> None:
+    asked = counted(monkeypatch)
+    out, place = tmp_path / "out", tmp_path / "frames"
+    out.mkdir()
+    shutil.copytree(walk, place)
+    sorted(place.rglob("*.png"))[gone].write_bytes(b"no picture")
+    for _ in range(2):
+        find_cameras([place], SequenceSettings(camera="auto"), out)
+    assert asked == [place]

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from rendered_walk import write_walk
 
 import sequence_encoders as encoders
 from fuzz_targets import scene
-from improvo.sequences import open_sequence
+from improvo.sequences import open_recording, open_sequence
+from improvo.sequences.content import content_of
 from sequence_builders import images, write_video
 
 FRAMES = 8
@@ -106,3 +109,24 @@ def test_a_file_that_is_written_over(tmp_path: Path) -> None:
     )
     assert sorted([*found, *skipped]) == list(range(FRAMES))
     assert "not a readable image" in skipped.values()
+
+
+def test_what_is_in_a_recording_is_told_wherever_it_lies(tmp_path: Path) -> None:
+    def content(path: Path) -> str:
+        return content_of(open_recording(path))
+
+    first, other = (write_walk(tmp_path / name, frames=7, seed=seed) for seed, name in enumerate(("a", "b")))
+    copy = tmp_path / "copy"
+    shutil.copytree(first, copy)
+    assert content(first) == content(copy) != content(other)
+    edited = copy / "000002.png"  # none of those that are decoded
+    cv2.imwrite(str(edited), 255 - cv2.imread(str(edited)))
+    assert content(copy) != content(first)
+    videos = []
+    for name, turned in (("one.mp4", 1), ("same.mp4", 1), ("two.mp4", -1)):
+        writer = cv2.VideoWriter(str(tmp_path / name), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (320, 240))
+        for picture in sorted(first.glob("*.png")):
+            writer.write(cv2.imread(str(picture))[::turned])
+        writer.release()
+        videos.append(content(tmp_path / name))
+    assert videos[0] == videos[1] != videos[2]

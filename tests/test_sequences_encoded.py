@@ -15,7 +15,7 @@ import ros_encoders
 import sequence_encoders as encoders
 from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import rigid, so3_exp
-from improvo.sequences import Sequence, open_sequence
+from improvo.sequences import Sequence, open_recording, open_sequence
 from sequence_builders import CAMERA, depths, images, poses
 from sequence_encoders import Scene
 
@@ -106,6 +106,26 @@ def test_icl_nuim_reflects_the_published_poses(tmp_path: Path) -> None:
     assert sequence.ground_truth is not None
     assert sequence.ground_truth.valid.tolist() == [False, True, True]
     np.testing.assert_allclose(sequence.ground_truth.world_from_cam[1:], expected.poses[1:], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "first", ["1 0 0 -2.25 0 0 0 1", "0 0 0 -2.5 0 0 0 1", "1 0 0 2.25 0 0 0 1", "1.5 0 0 -2.25 0 0 0 1"]
+)
+def test_icl_nuim_is_known_where_its_trajectory_is_named_as_that_of_tum(tmp_path: Path, first: str) -> None:
+    camera = Camera(640, 480, 481.2, 480.0, 319.5, 239.5)
+    expected = Scene(camera, np.arange(3) / 30, images(3, camera), depths(3, camera), poses(3))
+    folder = encoders.write_icl(tmp_path, expected)
+    published = next(folder.glob("*.gt.freiburg"))
+    rows = [first, *published.read_text().splitlines()[1:]]
+    (folder / "groundtruth.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows))
+    published.unlink()
+    of_icl = first in ("1 0 0 -2.25 0 0 0 1", "0 0 0 -2.5 0 0 0 1")
+    recording = open_recording(folder)
+    assert recording.format == ("icl" if of_icl else "tum")
+    assert recording.ground_truth is not None
+    flip = np.diag([1.0, -1.0, 1.0, 1.0])
+    last = expected.poses[2] if of_icl else flip @ expected.poses[2] @ flip
+    np.testing.assert_allclose(recording.ground_truth.world_from_cam[-1], last, atol=1e-9)
 
 
 def test_scannet_info_layout(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from improvo.errors import InputError
 from improvo.geometry.camera_files import calibration_yaml
 from improvo.geometry.se3 import inverse, rigid
 from improvo.sequences import SequenceSettings, open_recording, open_sequence
@@ -116,6 +117,33 @@ def test_kitti_uses_the_projection_of_its_camera(tmp_path: Path, number: int) ->
     assert all((frame.image == image).all() for frame, image in zip(sequence, images(COUNT), strict=True))
     assert sequence.ground_truth is not None
     np.testing.assert_allclose(sequence.ground_truth.world_from_cam, poses(COUNT) @ inverse(cam_from_cam0), atol=1e-9)
+
+
+@pytest.mark.parametrize("folder", ["image_l", "image_r", "image_0"])
+def test_kitti_copies_of_courses_name_no_camera_in_their_calibration(tmp_path: Path, folder: str) -> None:
+    write_images(tmp_path / folder, images(COUNT))
+    cam_from_cam0 = rigid(np.eye(3), np.array([-0.54, 0.0, 0.0]))
+    projections = [CAMERA.K @ np.eye(4)[:3], CAMERA.K @ cam_from_cam0[:3]]
+    np.savetxt(tmp_path / "calib.txt", [projection.ravel() for projection in projections])
+    np.savetxt(tmp_path / "poses.txt", poses(COUNT)[:, :3].reshape(COUNT, 12))
+    sequence = open_sequence(tmp_path)
+    assert sequence.format == "kitti"
+    np.testing.assert_allclose(sequence.camera.K, CAMERA.K, atol=1e-9)
+    np.testing.assert_allclose(sequence.times, np.arange(COUNT) / 10)
+    expected = poses(COUNT) @ inverse(cam_from_cam0) if folder == "image_r" else poses(COUNT)
+    assert sequence.ground_truth is not None
+    np.testing.assert_allclose(sequence.ground_truth.world_from_cam, expected, atol=1e-9)
+
+
+def test_a_folder_of_recordings_is_told_with_what_it_holds(tmp_path: Path) -> None:
+    for name in ("walk", "drive"):
+        write_images(tmp_path / name / "left", images(2))
+    (tmp_path / "notes.txt").write_text("both from Monday")
+    with pytest.raises(InputError, match=r"is no recording itself but holds drive, walk; give one of these"):
+        open_sequence(tmp_path)
+    (tmp_path / "walk" / "left").rename(tmp_path / "walk" / "mine")
+    with pytest.raises(InputError, match=r"walk: is no recording itself but holds mine; give that"):
+        open_sequence(tmp_path / "walk")
 
 
 def test_image_folder_orders_by_number_and_keeps_gaps_in_time(tmp_path: Path) -> None:

@@ -59,22 +59,36 @@ def test_the_card_says_what_they_are_the_mean_of(tmp_path: Path) -> None:
     trained = tmp_path / "trained.safetensors"
     save_weights(trained, trained_from(start).tensors, replace(start.card, training={"stage": "held", "steps": 300}))
     for name in ("a", "b"):
-        write_interpolated(START, trained, 0.7, tmp_path / f"{name}.safetensors")
+        write_interpolated([(START, 0.7)], trained, tmp_path / f"{name}.safetensors")
     assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
     card = load_weights(tmp_path / "a.safetensors").card
     assert card.training["steps"] == 300
-    assert card.training["interpolated"] == {
-        "start": START.name, "start_sha256": files.content_hash(START), "share": 0.7,
-    }  # fmt: skip
+    assert card.training["interpolated"] == [
+        {"start": START.name, "start_sha256": files.content_hash(START), "share": 0.7}
+    ]
     assert card.data == start.card.data
+
+
+def test_a_second_start_is_further_back(tmp_path: Path) -> None:
+    start = load_weights(START)
+    before, trained, out = (tmp_path / f"{name}.safetensors" for name in ("before", "trained", "out"))
+    save_weights(before, trained_from(start, 1.5).tensors, start.card)
+    save_weights(trained, trained_from(start, 2.0).tensors, start.card)
+    write_interpolated([(before, 0.8), (START, 0.9)], trained, out)
+    found = load_weights(out)
+    for name, values in found.tensors.items():  # 0.8 of the way from 1.5 to 2 is 1.9; then 0.9 of that from 1
+        np.testing.assert_allclose(values, 1.81 * start.tensors[name], rtol=1e-5)
+    assert [each["share"] for each in found.card.training["interpolated"]] == [0.8, 0.9]
 
 
 def test_the_default_goes_part_of_the_way_and_the_other_recipes_all_of_it() -> None:
     assert stages(ImproveSettings()) == (HELD, METRIC, "part-way")
-    assert stages(ImproveSettings(way=1.0)) == (HELD, METRIC)
+    assert stages(ImproveSettings(way=1.0, later_way=1.0)) == (HELD, METRIC)
     assert stages(ImproveSettings(then_metric=False)) == (HELD, "part-way")
     assert stages(ImproveSettings(recipe=METRIC)) == (METRIC,)
     assert stages(ImproveSettings(recipe=TRACKS)) == (TRACKS,)
     for way in (0.0, 1.1, float("nan")):
         with pytest.raises(ConfigError, match="way="):
             ImproveSettings(way=way)
+        with pytest.raises(ConfigError, match="later_way="):
+            ImproveSettings(later_way=way)

@@ -9,6 +9,7 @@ calls becomes part of it, so after an edit of the callee touch the file of the c
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,31 @@ def _is_cached(kernel: Any) -> bool:
 
 def _jit(function: Callable[..., Any], **options: Any) -> Any:
     try:
-        return njit(cache=True, **_OPTIONS, **options)(function)
+        kernel = njit(cache=True, **_OPTIONS, **options)(function)
     except RuntimeError:  # neither the package's folder nor the user's cache can be written: compile each time
         return njit(**_OPTIONS, **options)(function)
+    _never_depend_on_disk(kernel)
+    return kernel
+
+
+def _never_depend_on_disk(kernel: Any) -> None:
+    """Machine code that cannot be kept, or is damaged, costs a compilation and nothing else.
+
+    The disk of the cache may be full while there is space for the output, and a power cut may leave a file empty.
+    """
+    cache = kernel._cache
+    load, save = cache.load_overload, cache.save_overload
+
+    def loaded(*what: Any) -> Any:
+        try:
+            return load(*what)
+        except Exception:  # of unpickling and of the linker, many kinds
+            with suppress(Exception):
+                cache.flush()
+            return None
+
+    def saved(*what: Any) -> None:
+        with suppress(Exception):
+            save(*what)
+
+    cache.load_overload, cache.save_overload = loaded, saved

@@ -159,6 +159,16 @@ def from_dict(cls: type[T], values: dict[str, Any], where: str = "settings", bas
         raise ConfigError(f"{where}: {reason(error)}") from None
 
 
+def check_seed(seed: int) -> None:
+    """Refuse a seed that not every generator of random numbers takes.
+
+    Raises:
+        ConfigError: it is negative, or too large.
+    """
+    if not 0 <= seed < SEEDS:
+        raise ConfigError(f"seed={seed}: must be 0 or more, and less than {SEEDS}")
+
+
 def _check_numbers(settings: Any, prefix: str = "") -> None:
     """Refuse, in all sections, numbers that none of them can mean.
 
@@ -169,10 +179,17 @@ def _check_numbers(settings: Any, prefix: str = "") -> None:
         name, value = f"{prefix}{each.name}", getattr(settings, each.name)
         if dataclasses.is_dataclass(value):
             _check_numbers(value, f"{name}.")
-        elif isinstance(value, float) and not math.isfinite(value):
-            raise ValueError(f"setting `{name}`: {value} is no finite number")
+        elif not all(math.isfinite(number) for number in _floats(value)):
+            raise ValueError(f"setting `{name}`: {_shown(value)} is no finite number")
         elif each.name == "seed" and isinstance(value, int) and not 0 <= value < SEEDS:
             raise ValueError(f"setting `{name}`: {value} must be 0 or more, and less than {SEEDS}")
+
+
+def _floats(value: Any) -> list[float]:
+    """A number, or all in nested tuples."""
+    if isinstance(value, tuple):
+        return [number for item in value for number in _floats(item)]
+    return [value] if isinstance(value, float) else []
 
 
 def with_present_names(values: Any, section: str = "") -> Any:

@@ -10,6 +10,7 @@ from typing import Any
 from improvo import config
 from improvo.errors import ConfigError, InputError
 from improvo.files import write_json, write_text
+from improvo.untrusted.paths import check_readable
 from improvo.untrusted.text import load_json, load_yaml
 
 _LONGEST_VALUE = 60  # characters of a value in a message
@@ -45,10 +46,11 @@ class SettingsRecord:
         """The recorded settings under their present names; None where there is no record.
 
         Raises:
-            InputError: the file is damaged.
+            InputError: the file is damaged, or may not be read.
         """
         if not self.path.is_file():
             return None
+        check_readable(self.path)
         try:
             text = self.path.read_text(encoding="utf-8")
             values = load_json(text) if self.path.suffix == ".json" else load_yaml(text)

@@ -119,7 +119,7 @@ def is_being_written(path: Path) -> bool:
     process, token = int(match.group(1)[:9]), match.group(2) or ""
     if len(token) == len(_HOST) + 8 and not token.startswith(_HOST):  # of another machine, on a shared file system
         try:
-            return time.time() - path.lstat().st_mtime < _FOREIGN_SECONDS
+            return abs(time.time() - path.lstat().st_mtime) < _FOREIGN_SECONDS  # also where a clock was set back
         except OSError:
             return True
     another = process != os.getpid() and os.name == "posix"
@@ -193,7 +193,11 @@ def check_output_folder(path: Path, command: str) -> None:
         if owner != command:
             made_by = f"was made by `improvo {owner}`" if owner else "has files that improvo did not write"
             raise OutputError(f"{path}: exists and {made_by}; choose an empty or new output folder")
+    if path.is_symlink() and not path.exists():
+        raise OutputError(f"{path}: is a link to what is not there; choose another output folder")
     existing = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
+    if not existing.is_dir():
+        raise OutputError(f"{path}: {existing} is a file, not a folder; choose another output folder")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise OutputError(f"{path}: no permission to write in {existing}; choose another output folder")
 

@@ -23,6 +23,8 @@ class ObjectiveSettings:
     def __post_init__(self) -> None:
         if not self.huber_width > 0:
             raise ConfigError(f"huber_width={self.huber_width}: must be positive (large: no robust loss)")
+        if not self.depth_min >= 0:
+            raise ConfigError(f"depth_min={self.depth_min}: must not be negative")
         if not self.depth_min <= self.depth_max:
             raise ConfigError(f"depth_min={self.depth_min} is above depth_max={self.depth_max}: swap them")
         if not self.depth_weight >= 0:
@@ -48,3 +50,6 @@ class SolverSettings:
             raise ConfigError("damping: needs 0 < min_damping <= initial_damping <= max_damping")
         if not self.min_diagonal > 0:
             raise ConfigError(f"min_diagonal={self.min_diagonal}: must be positive")
+        for name in ("relative_decrease", "min_gain"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigError(f"{name}={getattr(self, name)}: is a share, at least 0 and under 1")

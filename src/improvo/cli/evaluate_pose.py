@@ -10,6 +10,7 @@ import argparse
 import json
 import tempfile
 import zlib
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -145,7 +146,8 @@ def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     from improvo.cli.evaluate_options import DEFAULT_FRONTENDS, exported_features, loaded_frontends
     from improvo.evaluation.pose.results import results, write_records
     from improvo.evaluation.pose.run import run_pose_protocol
-    from improvo.files import check_output_folder, make_output_folder, write_json
+    from improvo.files import check_output_folder, write_json
+    from improvo.folder_lock import working_in
     from improvo.jobs.pool import Workers
 
     settings, sources = _settings(arguments)
@@ -161,28 +163,27 @@ def _evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         earlier = read_results(output / "pose.json")
         if earlier.get("request") == json.loads(json.dumps(request)):
             return earlier
-    if output is not None:
-        make_output_folder(output, COMMAND)
     with (
+        nullcontext() if output is None else working_in(output, COMMAND),
         tempfile.TemporaryDirectory(prefix="improvo-") as temporary,
         Workers(arguments.workers, progress=True) as workers,
     ):
         cache = (output or Path(temporary)) / "features"
         run = run_pose_protocol(list(sources), frontends, settings, cache, workers)
-    found = {
-        "protocol": "pose",
-        "improvo": __version__,
-        **results(run),
-        "skipped_frontends": skipped,
-        "request": request,
-    }
-    if output is not None:
-        for curves in output.glob("curves-*.png"):  # of an earlier evaluation, by other solvers
-            curves.unlink()
-        write_records(run, output / "pairs.parquet")
-        write_json(output / "pose.json", found)
-        _write_text(found, output)
-        _draw(found, output)
+        found = {
+            "protocol": "pose",
+            "improvo": __version__,
+            **results(run),
+            "skipped_frontends": skipped,
+            "request": request,
+        }
+        if output is not None:
+            for curves in output.glob("curves-*.png"):  # of an earlier evaluation, by other solvers
+                curves.unlink()
+            write_records(run, output / "pairs.parquet")
+            write_json(output / "pose.json", found)
+            _write_text(found, output)
+            _draw(found, output)
     return found
 
 
@@ -234,19 +235,20 @@ def _request(settings: PoseSettings, sources: list[Recorded], frontends: list[Fe
     from improvo.config import to_dict
     from improvo.evaluation.sources import sequence_fingerprint
 
-    truths = {source.open().name: _poses_digest(source) for source in sources if source.truth is not None}
+    sequences = [source.open() for source in sources]
+    truths = {
+        sequence.name: zlib.crc32(sequence.ground_truth.world_from_cam.tobytes())
+        for sequence in sequences
+        if sequence.ground_truth is not None
+    }
     return {
         "settings": to_dict(settings),
-        "sequences": [sequence_fingerprint(source, source.open()) for source in sources],
-        **({"truth": truths} if truths else {}),
+        "sequences": [
+            sequence_fingerprint(source, sequence) for source, sequence in zip(sources, sequences, strict=True)
+        ],
+        "truth": truths,
         "frontends": [{"label": frontend.label, **frontend.fingerprint()} for frontend in frontends],
     }
-
-
-def _poses_digest(source: Recorded) -> int:
-    truth = source.open().ground_truth
-    assert truth is not None
-    return zlib.crc32(truth.world_from_cam.tobytes())
 
 
 def _write_text(results: dict[str, Any], output: Path) -> None:

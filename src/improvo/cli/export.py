@@ -31,33 +31,33 @@ def run_colmap(arguments: argparse.Namespace) -> None:
     """Write the model of every segment, the longest first."""
     from improvo.export.colmap import write_colmap
     from improvo.export.model import segment_model, segments_by_length
-    from improvo.files import make_output_folder
+    from improvo.folder_lock import working_in
     from improvo.odometry.run_folder import RunFolder
 
     _check_model_arguments(arguments)
     run_folder = RunFolder(arguments.folder, arguments.sequence)
     segments = segments_by_length(run_folder)
     models = [segment_model(run_folder, each, arguments.max_error, arguments.min_observations) for each in segments]
-    make_output_folder(arguments.output, "export colmap")
-    _clear_models(arguments.output / "sparse")
-    written = []
-    for number, model in enumerate(models):
-        colours = None if arguments.no_images else _write_images(run_folder, model, arguments.output / "images")
-        target = arguments.output / "sparse" / str(number)
-        write_colmap(model, run_folder.camera, target, colours)
-        say(
-            f"{target}: {len(model.frames)} images, {_points(model)}, {len(model.error)} observations, "
-            f"mean re-projection error {model.mean_error:.6f} px"
-        )
-        written.append(
-            {
-                "folder": str(target),
-                "images": len(model.frames),
-                "points": len(model.xyz),
-                "observations": len(model.error),
-                "mean_error": round(model.mean_error, 6),
-            }
-        )
+    with working_in(arguments.output, "export colmap"):
+        _clear_models(arguments.output / "sparse")
+        written = []
+        for number, model in enumerate(models):
+            colours = None if arguments.no_images else _write_images(run_folder, model, arguments.output / "images")
+            target = arguments.output / "sparse" / str(number)
+            write_colmap(model, run_folder.camera, target, colours)
+            say(
+                f"{target}: {len(model.frames)} images, {_points(model)}, {len(model.error)} observations, "
+                f"mean re-projection error {model.mean_error:.6f} px"
+            )
+            written.append(
+                {
+                    "folder": str(target),
+                    "images": len(model.frames),
+                    "points": len(model.xyz),
+                    "observations": len(model.error),
+                    "mean_error": round(model.mean_error, 6),
+                }
+            )
     figures({"models": written, "map_points": len(run_folder.map)}, "")
     say(f"  the map of the run joins tracks of the same place to {len(run_folder.map)} points")
     next_step(f"open {arguments.output / 'sparse' / '0'} with COLMAP, pycolmap or what reads their model")
@@ -72,16 +72,16 @@ def run_nerfstudio(arguments: argparse.Namespace) -> None:
     """Write the longest segment; one scene has one world."""
     from improvo.export.model import segment_model, segments_by_length
     from improvo.export.nerfstudio import write_nerfstudio
-    from improvo.files import make_output_folder
+    from improvo.folder_lock import working_in
     from improvo.odometry.run_folder import RunFolder
 
     _check_model_arguments(arguments)
     run_folder = RunFolder(arguments.folder, arguments.sequence)
     segments = segments_by_length(run_folder)
     model = segment_model(run_folder, segments[0], arguments.max_error, arguments.min_observations)
-    make_output_folder(arguments.output, "export nerfstudio")
-    colours = _write_images(run_folder, model, arguments.output / "images")
-    write_nerfstudio(model, run_folder.camera, arguments.output, colours)
+    with working_in(arguments.output, "export nerfstudio"):
+        colours = _write_images(run_folder, model, arguments.output / "images")
+        write_nerfstudio(model, run_folder.camera, arguments.output, colours)
     say(f"{arguments.output / 'transforms.json'}: {len(model.frames)} images, {_points(model)}")
     if len(segments) > 1:
         left = run_folder.frames - len(model.frames)

@@ -50,7 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
     from improvo.export.colmap_database import write_colmap_database
     from improvo.export.features import matched_frames
     from improvo.export.hloc import check_h5py, write_hloc
-    from improvo.files import check_output_folder, make_output_folder
+    from improvo.files import check_output_folder
+    from improvo.folder_lock import working_in
     from improvo.frontend.registry import frontend_from
     from improvo.sequences import open_sequence
     from improvo.terminal import counted, progress
@@ -64,9 +65,8 @@ def run(arguments: argparse.Namespace) -> int:
     if sequence.length is None:
         raise InputError(f"{sequence.path}: is live; record it first")
     frontend = frontend_from(settings.frontend)
-    make_output_folder(folder, "export features")
     images = None if arguments.no_images else folder / "images"
-    with progress("features", "frame", sequence.length) as shown:
+    with working_in(folder, "export features"), progress("features", "frame", sequence.length) as shown:
         frames = matched_frames(sequence, frontend, settings, images, shown.advance)
         if for_hloc:
             written = write_hloc(frames, sequence.camera, folder, settings.descriptors)

@@ -1,7 +1,8 @@
 """Self-improvement: train a network on video by its own odometry, keep it if it got better on video it never saw.
 
 Leaves OUT/weights.safetensors, the best of all rounds and of the start, and OUT/report.html. Part of the video is held
-out and never trained on; run again to continue a run that was stopped, or with a higher --rounds.
+out and never trained on; run again to continue a run that was stopped, or with a higher --rounds. By itself it makes
+two rounds, or one where the first is not better, or where two would take much more than half an hour.
 """
 
 from __future__ import annotations
@@ -43,7 +44,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plan", action="store_true", help="label a short sample only, and say what all of it will cost"
     )
-    parser.add_argument("--rounds", type=int, default=1, metavar="N", help="of labelling, training and validation")
+    parser.add_argument(
+        "--rounds",
+        type=int,
+        metavar="N",
+        help="of training and validation; where one is not better the next tries again (default: 2, or 1 where that is "
+        "not better or two take much more than half an hour)",
+    )
     parser.add_argument(
         "--evaluate",
         type=recording_path,
@@ -106,7 +113,7 @@ def _of_both_recipes(arguments: argparse.Namespace) -> list[str]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Improve; 0 also where no round was better than the start, which is said."""
-    if arguments.rounds < 1:
+    if arguments.rounds is not None and arguments.rounds < 1:
         raise ConfigError(f"--rounds {arguments.rounds}: must be at least 1")
     settings = settings_from(ImproveSettings, arguments, extra=_of_both_recipes(arguments))
     check_recordings(arguments.sequences, settings.sequence)
@@ -149,7 +156,7 @@ def run(arguments: argparse.Namespace) -> int:
         say("no round was better than the start; its weights are kept")
     if result.control:
         gain = gain_words(result.control[1], result.validations[0], settings.validation)
-        say(f"control, by homographies alone: right matches {gain}")
+        say(f"{result.control[0].name}, by homographies alone: right matches {gain}")
     say(f"weights in {result.weights}")
     say(f"report in {arguments.output / 'report.html'}")
     next_step(f"`improvo run SEQUENCE --frontend {typed(result.weights)} -o out` uses them")
@@ -168,6 +175,6 @@ def _plan(arguments: argparse.Namespace, settings: ImproveSettings) -> int:
         plan = plan_improvement(
             arguments.sequences, settings, arguments.rounds, arguments.evaluate, shown.advance, arguments.after
         )
-    say_improve_plan(plan, arguments.rounds)
+    say_improve_plan(plan, arguments.rounds is not None)
     next_step("the same without --plan and with -o OUT does it")
     return 0

@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import errno
 import io
+import logging
 import os
 import sys
 import tempfile
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
@@ -67,6 +69,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Descriptors are matched in small products of matrices: threads of OpenBLAS make that slower.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("MPLCONFIGDIR", str(cache_folder() / "matplotlib"))  # made by matplotlib, if it is used
+    warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)  # of a name in a title
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # warns where it cannot make that, and works
     try:
         arguments = _parsed(words)
         _check_paths(arguments)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from improvo.config import check_seed
 from improvo.errors import ConfigError
 from improvo.geometry.depth_sampling import SAMPLINGS
 from improvo.geometry.ransac import poselib_installed
@@ -67,11 +68,10 @@ class PoseSettings:
         if self.depth_sampling not in SAMPLINGS:
             raise ConfigError(f"depth_sampling `{self.depth_sampling}` is unknown; choose among {', '.join(SAMPLINGS)}")
         limits = (self.max_rotation_deg, self.max_translation_m, self.max_error_px, self.depth_edge)
-        if (
-            min(*limits, *self.right_px, self.curve_rotation_deg, self.curve_translation_m) <= 0
-            or not 0 < self.confidence < 1
-        ):
+        curves = (self.curve_rotation_deg, self.curve_translation_m)
+        if not (all(limit > 0 for limit in (*limits, *self.right_px, *curves)) and 0 < self.confidence < 1):
             raise ConfigError("thresholds must be positive, and confidence between 0 and 1")
+        check_seed(self.seed)
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,9 @@ class TrajectorySettings:
         lengths = (*self.time_windows, *self.distance_windows, *self.path_fractions, self.window_tolerance)
         if not all(math.isfinite(length) and length > 0 for length in lengths):
             raise ConfigError("sub-trajectory lengths and window_tolerance must be positive numbers")
+        for name, shares in (("path_fractions", self.path_fractions), ("window_tolerance", (self.window_tolerance,))):
+            if not all(share <= 1 for share in shares):
+                raise ConfigError(f"{name}: {max(shares):g} is no share, which is at most 1")
         if not self.max_time_difference >= 0:
             raise ConfigError("max_time_difference must be 0 or more seconds")
 
@@ -112,8 +115,10 @@ class HomographySettings:
     def __post_init__(self) -> None:
         if self.max_keypoints < 4 or self.views < 1 or self.longest_side < 32 or self.resamples < 1:
             raise ConfigError("max_keypoints must be 4 or more, longest_side 32 or more, views and resamples 1 or more")
-        if not self.corner_errors_px or min(*self.corner_errors_px, self.max_error_px, self.ransac_px) <= 0:
+        limits = (*self.corner_errors_px, self.max_error_px, self.ransac_px)
+        if not self.corner_errors_px or not all(limit > 0 for limit in limits):
             raise ConfigError("thresholds must be positive pixels")
+        check_seed(self.seed)
         if not 0 < self.confidence < 1:
             raise ConfigError(f"confidence={self.confidence}: is a share between 0 and 1, such as 0.95")
 

@@ -16,6 +16,8 @@ from improvo.files import content_hash
 from improvo.frontend import Frontend
 from improvo.frontend.masking import features_of
 from improvo.sequences import Sequence, SequenceSettings
+from improvo.sequences.content import content_of
+from improvo.sequences.given_files import mask_content
 from improvo.types import Features, Frame, UInt8
 
 
@@ -195,7 +197,7 @@ def refuse_equal_names(what: str, names: list[str]) -> None:
 
 
 def sequence_fingerprint(source: SequenceSource, sequence: Sequence) -> dict[str, Any]:
-    """All that decides a sequence's frames: its name, length, camera, times, settings, and the first image."""
+    """All that decides a sequence's frames: name, length, camera, times, settings, and what is in them and the mask."""
     settings = getattr(source, "settings", None)
     mask = None
     try:
@@ -211,5 +213,7 @@ def sequence_fingerprint(source: SequenceSource, sequence: Sequence) -> dict[str
         "times": zlib.crc32(sequence.times.tobytes()),
         "first_image": first,
         "first_mask": mask,
+        "content": content_of(sequence.recording) if settings is not None else "",
+        "mask_content": mask_content(sequence.settings) if settings is not None else "",
         "settings": asdict(settings) if settings is not None else {},
     }

@@ -57,12 +57,19 @@ class Bootstrap:
         seed: of the resamples.
         resamples: how many.
         confidence: of the interval.
+        block: neighbouring trials that are drawn together, where what is true of one is likely true of the next
+            (the circular block bootstrap, Politis and Romano 1992); 1 draws each for itself.
     """
 
-    def __init__(self, count: int, seed: int, resamples: int = 1000, confidence: float = 0.95) -> None:
+    def __init__(self, count: int, seed: int, resamples: int = 1000, confidence: float = 0.95, block: int = 1) -> None:
         rng = np.random.default_rng(seed)
-        shares = np.full(count, 1.0 / count)
-        self._weights = rng.multinomial(count, shares, size=resamples).astype(np.float32) / np.float32(count)
+        if block == 1:
+            drawn = rng.multinomial(count, np.full(count, 1.0 / count), size=resamples)
+        else:
+            first = rng.integers(0, count, size=(resamples, -(-count // block), 1))
+            trials = (first + np.arange(block)).reshape(resamples, -1)[:, :count] % count
+            drawn = np.stack([np.bincount(each, minlength=count) for each in trials])
+        self._weights = drawn.astype(np.float32) / np.float32(count)
         self._percentiles = [50 * (1 - confidence), 50 * (1 + confidence)]
 
     def interval(self, values: NDArray[np.generic]) -> tuple[float, float]:

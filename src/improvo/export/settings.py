@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from improvo.config import check_seed
 from improvo.errors import ConfigError
 from improvo.frontend.settings import FrontendSettings
 from improvo.sequences.base import SequenceSettings
@@ -29,3 +30,4 @@ class FeatureExportSettings:
             raise ConfigError(f"descriptors `{self.descriptors}`: is float16 or float32")
         if not self.max_distance > 0:
             raise ConfigError(f"max_distance={self.max_distance}: must be positive; 0.7 is the paper's")
+        check_seed(self.seed)

@@ -18,6 +18,7 @@ from improvo.frontend.architecture import Architecture, Convolution
 from improvo.types import Float32
 from improvo.untrusted.arrays import check_array
 from improvo.untrusted.limits import MAX_WEIGHTS_BYTES
+from improvo.untrusted.paths import check_readable
 from improvo.untrusted.text import load_json, reason
 
 BUNDLED = Path(__file__).parent / "weights"
@@ -139,6 +140,7 @@ def load_weights(path: Path) -> Weights:
 
     if not path.is_file():
         raise InputError(f"{path}: no such weights file; bundled: {', '.join(bundled_names()) or 'none'}")
+    check_readable(path)
     try:
         check_array("tensors", (path.stat().st_size,), 1, MAX_WEIGHTS_BYTES)
         with safe_open(path, framework="numpy") as file:

@@ -29,6 +29,15 @@ class Similarity:
         a_from_cam[:, :3, 3] = self.apply(b_from_cam[:, :3, 3])
         return a_from_cam
 
+    def inverse(self) -> Similarity:
+        """Frame b from frame a.
+
+        Raises:
+            ZeroDivisionError: the scale is 0.
+        """
+        scale = 1.0 / self.scale
+        return Similarity(scale, self.rotation.T, -scale * self.rotation.T @ self.translation)
+
     def after(self, other: Similarity) -> Similarity:
         """Frame a from frame c, where `other` is frame b from frame c."""
         return Similarity(self.scale * other.scale, self.rotation @ other.rotation, self.apply(other.translation))

@@ -22,3 +22,9 @@ class TriangulationSettings:
             raise ConfigError(f"triangulation loss={self.loss!r}: must be huber or geman_mcclure")
         if not self.loss_width > 0:
             raise ConfigError(f"triangulation loss_width={self.loss_width}: must be positive")
+        if self.max_iterations < 0:
+            raise ConfigError(f"triangulation max_iterations={self.max_iterations}: must not be negative")
+        if not 0 <= self.min_parallax_deg <= 180:
+            raise ConfigError(
+                f"triangulation min_parallax_deg={self.min_parallax_deg}: is an angle of 0 to 180 degrees"
+            )

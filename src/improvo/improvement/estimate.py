@@ -82,7 +82,7 @@ def estimate(
 
     Args:
         settings: of the loop.
-        rounds: to come.
+        rounds: to come; a control has as many.
         training, held_back: frames of the two parts.
         pixels: of a frame.
         costs: of its parts.
@@ -91,7 +91,7 @@ def estimate(
     reference = settings.reference
     deep = min(training, reference.most_training) + min(held_back, reference.most_held_back)
     steps = steps_of(settings, training)
-    trainings = rounds + settings.control
+    trainings, judged = rounds * (1 + settings.control), rounds + settings.control
     each, planned = 0.0, stages(settings)
     if planned != (METRIC,):
         each += costs.start + (60 * settings.minutes if settings.minutes else steps * costs.step)
@@ -100,9 +100,9 @@ def estimate(
     labeled = training if settings.teaches_labels else 0
     # of a whole recording the reference run, which every recipe makes, has the labels of the start already
     again = 0 if recordings else labeled + held_back
-    frames = training + held_back + again + (rounds - 1) * labeled + trainings * held_back
+    frames = training + held_back + again + (rounds - 1) * labeled + judged * held_back
     pairs = max(recordings, 1) * min(settings.validation.matches.pairs, held_back // max(recordings, 1))
-    validations = (1 + trainings) * pairs * _GAPS * costs.pair
+    validations = (1 + judged) * pairs * _GAPS * costs.pair
     others = deep * costs.depth + trainings * each + validations
     small = min(pixels, settings.held.longer_side**2 * 3 // 4)
     taught = min(training, reference.most_training)
@@ -110,7 +110,8 @@ def estimate(
     if settings.recipe == HELD and settings.held.pairs.whole_frames:
         remembered = min(taught, settings.held.pairs.frames_remembered)
         memory += remembered * _MIB_PER_REMEMBERED * small / (640 * 480)
-    disk = 60 + 0.1 * (training + held_back) * (1 + trainings) + deep * pixels / 4 * 1.3 / _MIB + 12 * trainings
+    labels = 0.1 * (training + held_back + rounds * labeled + (1 + judged) * held_back)
+    disk = 60 + labels + deep * pixels / 4 * 1.3 / _MIB + 12 * trainings
     return Estimate((frames * costs.frame + others) / 60, memory, disk, steps, frames, others / 60)
 
 

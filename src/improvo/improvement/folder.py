@@ -17,6 +17,7 @@ from improvo.locations import removed
 from improvo.sequences.given_files import CONTENTS, contents_of_given
 
 COMMAND = "improve"
+_CONTROL = "control-"
 # settings of the optimiser that may differ when a run is continued: none of these alters a result
 _FREE = ("device", "threads", "workers", "checkpoint_minutes", "log_every")
 
@@ -36,6 +37,11 @@ class Candidate:
 
     name: str  # "start", "round 1"
     folder: Path
+
+    @property
+    def is_control(self) -> bool:
+        """Whether it was trained by homographies alone."""
+        return self.folder.name.startswith(_CONTROL)
 
     @property
     def weights(self) -> Path:
@@ -68,7 +74,7 @@ class ImproveFolder:
         settings.yaml          what the result depends on; other settings are refused
         split.json             which frames are trained on, and which held back
         reference/             the fixed run that teaches and judges: labels, depth-training.zip, depth-held-back.zip
-        start/, round-1/ ...   a `Candidate` each; control/ is one too
+        start/, round-1/ ...   a `Candidate` each; control-1/, control-2/ ... are too
         weights.safetensors    the best of them, with weights.json
         report.html
 
@@ -124,10 +130,10 @@ class ImproveFolder:
         """The frontend that a round has trained."""
         return Candidate(f"round {number}", self.folder / f"round-{number}")
 
-    @property
-    def control(self) -> Candidate:
-        """The start, trained by homographies alone; never the best."""
-        return Candidate("control", self.folder / "control")
+    def control(self, rounds: int) -> Candidate:
+        """The start, trained for so many rounds by homographies alone; never the best."""
+        name = "control" if rounds == 1 else f"control, {rounds} rounds"
+        return Candidate(name, self.folder / f"{_CONTROL}{rounds}")
 
     def finished_rounds(self) -> int:
         """How many rounds are complete."""

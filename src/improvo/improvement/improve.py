@@ -20,7 +20,7 @@ from improvo.frontend.weights import load_weights, save_weights
 from improvo.improvement.earlier import earlier_runs
 from improvo.improvement.estimate import refuse_full_disk
 from improvo.improvement.folder import COMMAND, Candidate, ImproveFolder
-from improvo.improvement.plan import first_estimate
+from improvo.improvement.plan import first_estimate, usual_rounds
 from improvo.improvement.progress import ImprovementProgress
 from improvo.improvement.recipe import Train, TrainingJob
 from improvo.improvement.reference import HELD_BACK, TRAINING, ReferencePart
@@ -30,6 +30,7 @@ from improvo.improvement.settings import ImproveSettings
 from improvo.improvement.split import Split
 from improvo.improvement.validation import Validation, is_better, rule, summary
 from improvo.sequences.given_files import with_absolute_files
+from improvo.terminal import counted
 
 if TYPE_CHECKING:
     from improvo.frontend.weights import DataSource
@@ -43,14 +44,15 @@ class Improvement:
     best: int  # its row in the following
     candidates: tuple[Candidate, ...]  # the first is the start
     validations: tuple[Validation, ...]
-    control: tuple[Candidate, Validation] | None = None  # the start, trained by homographies alone
+    kept: tuple[int, ...] = ()  # the rounds that were better than all before them, of which the best is made
+    control: tuple[Candidate, Validation] | None = None  # the start, trained by homographies alone, as many rounds
 
 
 def improve(
     sequences: Sequence[Path],
     output: Path,
     settings: ImproveSettings,
-    rounds: int = 1,
+    rounds: int | None = None,
     evaluate: Sequence[Path] = (),
     workers: int | None = None,
     ray: str | None = None,
@@ -65,7 +67,8 @@ def improve(
         sequences: the recordings; part of them is held back and never trained on.
         output: folder of the result; an unfinished one is continued.
         settings: all of them; `settings.frontend.name` is where the loop starts.
-        rounds: of labelling, training and validation.
+        rounds: of training and validation, each from the best weights before it. By default they end with the first
+            that is not better, and after those of `improvo.improvement.plan.usual_rounds`.
         evaluate: recordings to hold back; without any, some of `sequences`, or the last part of a single one.
         workers: sequences labelled at a time, a process with one core for each; by default one, in this process.
         ray: address of a Ray cluster that labels them, see `improvo.jobs.on_ray`.
@@ -91,9 +94,10 @@ def improve(
     first_weights = earlier.first_weights(settings.frontend.name)
     make_output_folder(output, COMMAND)
     with locked(output):
-        needed = first_estimate(sequences, settings, rounds, evaluate)
+        most = rounds or usual_rounds(sequences, settings, evaluate)
+        needed = first_estimate(sequences, settings, most, evaluate)
         if needed is not None:
-            progress.line(f"estimate: {needed.words}")
+            progress.line(f"estimate: {needed.words}, {'' if rounds else 'up to '}{counted(most, 'round')}")
             refuse_full_disk(output, needed)  # before the settings are recorded, which fewer steps would contradict
         folder = ImproveFolder(output, sequences, evaluate, settings, first_weights, after)
         loop = Rounds(folder, settings, train or _train, data, workers, ray, progress)
@@ -106,7 +110,10 @@ def improve(
         result = Improvement(folder.weights, 0, (start,), (loop.validate(start, split.held_back, judging),))
         progress.validated(start, result.validations[0], result.validations[0], settings.validation)
         _keep(result, folder, split, settings)
-        for number in range(1, max(rounds, folder.finished_rounds()) + 1):
+        for number in range(1, max(most, folder.finished_rounds()) + 1):
+            if rounds is None and number > folder.finished_rounds() and result.best < number - 1:
+                progress.line(f"no further round, since the last was not better; --rounds {number} tries once more")
+                break
             teacher = result.candidates[result.best]
             candidate = folder.round(number)
             if not candidate.validation.is_file():
@@ -119,13 +126,15 @@ def improve(
             result = replace(
                 result,
                 best=number if better else result.best,
+                kept=(*result.kept, number) if better else result.kept,
                 candidates=(*result.candidates, candidate),
                 validations=(*result.validations, validation),
             )
-            if number == 1 and settings.control:
-                control = _control(loop, folder, result, split, (teaching, judging))
-                progress.validated(*control, result.validations[0], settings.validation)
-                result = replace(result, control=control)
+            _keep(result, folder, split, settings)
+        if settings.control:
+            control = _control(loop, folder, result, split, (teaching, judging))
+            progress.validated(*control, result.validations[0], settings.validation)
+            result = replace(result, control=control)
             _keep(result, folder, split, settings)
         return result
 
@@ -137,12 +146,15 @@ def _control(
     split: Split,
     reference: tuple[list[ReferencePart], list[ReferencePart]],
 ) -> tuple[Candidate, Validation]:
-    """What as many steps from the same start give by homographies of the same frames alone."""
-    start, trained = result.candidates[0], result.candidates[1]
-    control = folder.control
-    if not control.validation.is_file():
-        steps = int(load_weights(trained.weights).card.training.get("steps", 0))
-        loop.train(control, 1, start, split.training, reference[0], steps)
+    """What as many rounds of as many steps as the best is made of give by homographies of the same frames alone.
+
+    Where no round was better it is one, as the first was.
+    """
+    control = result.candidates[0]
+    for number, of_round in enumerate(result.kept or (1,), 1):
+        teacher, control = control, folder.control(number)
+        steps = int(load_weights(result.candidates[of_round].weights).card.training.get("steps", 0))
+        loop.train(control, number, teacher, split.training, reference[0], steps)
     return control, loop.validate(control, split.held_back, reference[1])
 
 

@@ -19,6 +19,10 @@ from improvo.improvement.split import whole_held_back
 from improvo.labeling.plan import LabelPlan, plan_labels
 from improvo.sequences import open_sequence
 
+_MOST_ROUNDS = 2  # that are made without being asked for: a third one gains here, and costs other places more
+_USUAL_MINUTES = 30.0  # that they may take
+_AND_A_HALF = 1.5  # times what one round takes, which they may take where that is more
+
 
 @dataclass(frozen=True)
 class ImprovePlan:
@@ -26,6 +30,7 @@ class ImprovePlan:
 
     once: LabelPlan  # all recordings labelled once, by the frontend at the start
     needed: Estimate
+    rounds: int  # at most
     measured: bool  # whether depth, training and validation are, on this machine; then their minutes are of one core
 
     @property
@@ -37,7 +42,7 @@ class ImprovePlan:
 def plan_improvement(
     sequences: Sequence[Path],
     settings: ImproveSettings,
-    rounds: int,
+    rounds: int | None = None,
     evaluate: Sequence[Path] = (),
     on_frames: Callable[[int], None] = lambda count: None,
     after: Path | None = None,
@@ -60,6 +65,7 @@ def plan_improvement(
     frontend = replace(settings.frontend, name=str(weights))
     paths = list(dict.fromkeys([*sequences, *evaluate]))
     pixels = _pixels(paths, settings)
+    rounds = rounds or usual_rounds(sequences, settings, evaluate)
     with tempfile.TemporaryDirectory(prefix="improvo-plan-") as folder:
         store = Path(folder) / "labels"
         run_settings = settings.run_settings(settings.sequence, frontend)
@@ -70,7 +76,22 @@ def plan_improvement(
     whole = len(evaluate) or whole_held_back(len(paths), settings.split.share)
     training = once.frames - held_back
     needed = estimate(settings, rounds, training, held_back, pixels, measured or costs, whole)
-    return ImprovePlan(once, needed, measured is not None)
+    return ImprovePlan(once, needed, rounds, measured is not None)
+
+
+def usual_rounds(sequences: Sequence[Path], settings: ImproveSettings, evaluate: Sequence[Path] = ()) -> int:
+    """How many rounds the loop makes at most where none are asked for: what fits in half an hour, or costs little more.
+
+    Known from the lengths of the recordings alone, and whether there is a control or not, so that a run that was
+    stopped goes on as it was begun.
+
+    Args:
+        sequences, settings, evaluate: see `improve`.
+    """
+    settings = replace(settings, control=False)
+    needed = [first_estimate(sequences, settings, rounds, evaluate) for rounds in range(1, _MOST_ROUNDS + 1)]
+    minutes = [each.minutes for each in needed if each is not None]
+    return sum(each <= max(_USUAL_MINUTES, _AND_A_HALF * minutes[0]) for each in minutes) or 1
 
 
 def first_estimate(

@@ -37,6 +37,7 @@ class TrainingJob:
     steps: int = 0  # of the control; 0 for what the settings say
     data: tuple[DataSource, ...] = ()
     progress: bool = True
+    first: Path | None = None  # weights that the loop began with, if other than `start`
 
     @property
     def weights(self) -> Path:
@@ -59,7 +60,8 @@ def stages(settings: ImproveSettings) -> tuple[str, ...]:
     """What a training does, one after the other, named as the recipes that do one of them alone."""
     if settings.recipe != HELD:
         return (settings.recipe,)
-    return (HELD, *((METRIC,) if settings.then_metric else ()), *((_PART_WAY,) if settings.way < 1 else ()))
+    part_way = min(settings.way, settings.later_way) < 1
+    return (HELD, *((METRIC,) if settings.then_metric else ()), *((_PART_WAY,) if part_way else ()))
 
 
 def train(job: TrainingJob) -> dict[str, Any]:
@@ -72,7 +74,7 @@ def train(job: TrainingJob) -> dict[str, Any]:
     for number, stage in enumerate(stages(job.settings)):
         part = job.of_stage(number)
         if stage == _PART_WAY:
-            _go_back(part, job.start)
+            _go_back(part, job)
         else:
             row |= trains[stage](part)
     return row
@@ -135,11 +137,15 @@ def _train_metric(job: TrainingJob) -> dict[str, Any]:
         return {}
 
 
-def _go_back(job: TrainingJob, start: Path) -> None:
+def _go_back(part: TrainingJob, whole: TrainingJob) -> None:
+    """Towards what the training began with, then, of a later round, towards what the loop began with."""
     from improvo.training.interpolated_weights import write_interpolated
 
-    job.output.mkdir(exist_ok=True)
-    write_interpolated(start, job.start, job.settings.way, job.output / _WEIGHTS)
+    part.output.mkdir(exist_ok=True)
+    ends = [(whole.start, part.settings.way)]
+    if whole.first is not None:
+        ends.append((whole.first, part.settings.later_way))
+    write_interpolated(ends, part.start, part.output / _WEIGHTS)
 
 
 def _teaching(job: TrainingJob, longer_side: int) -> list[PosedSequence]:

@@ -188,7 +188,7 @@ def _verdict(
         words += " No round was better than the start: the weights kept are those at the start, unchanged."
         words += f" {candidates[-1].name}: {gain_words(validations[-1], start, how)}."
     if control:
-        words += " The control, trained for as many steps on the same frames by homographies alone: "
+        words += " The control, trained for as many rounds and steps on the same frames by homographies alone: "
         words += f"{gain_words(control[1], start, how)}."
     return words
 

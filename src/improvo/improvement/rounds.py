@@ -155,9 +155,9 @@ class Rounds:
         """The candidate of a round: the teacher's weights, trained on.
 
         Args:
-            candidate: of the round, or the control; nothing is done where its weights are there already.
+            candidate: of the round, or a control; nothing is done where its weights are there already.
             number: of the round, from 1.
-            teacher: the best candidate before it.
+            teacher: the best candidate before it, of a control the control of one round less.
             part: the training part.
             reference: of the training part.
             steps: of the control.
@@ -166,18 +166,20 @@ class Rounds:
             return
         candidate.folder.mkdir(exist_ok=True)
         settings = self._settings
+        start = self._folder.start
         seed = (settings.training if settings.recipe == TRACKS else settings.held).optimiser.seed
         job = TrainingJob(
             settings,
             seed + number - 1,  # another try from the same weights and labels must not be the same try
             teacher.weights,
             candidate.training,
-            teacher.labels,
+            start.labels if candidate.is_control else teacher.labels,
             tuple(reference),
-            control=candidate == self._folder.control,
+            control=candidate.is_control,
             steps=steps,
             data=self._data,
             progress=self._progress.shown,
+            first=None if teacher == start else start.weights,
         )
         if self._trains_there():
             with self._progress.bar("training on the cluster", "step") as tick:

@@ -45,7 +45,7 @@ class ReferenceSettings:
     depth: DepthSettings = field(default_factory=DepthSettings)
 
     def __post_init__(self) -> None:
-        if self.frames_per_second <= 0 or self.stretch_seconds <= 0:
+        if not (self.frames_per_second > 0 and self.stretch_seconds > 0):
             raise ConfigError("settings `reference.frames_per_second` and `reference.stretch_seconds`: must be above 0")
         if min(self.dense_up_to, self.most_training, self.most_held_back) < 2:
             raise ConfigError(
@@ -77,6 +77,12 @@ class ValidationSettings:
             raise ConfigError("validation.overlaps: give the largest first")
         if self.min_pairs < 1:
             raise ConfigError(f"validation.min_pairs={self.min_pairs}: must be at least 1")
+        if not 0 <= self.frames_lost <= 1:
+            raise ConfigError(f"validation.frames_lost={self.frames_lost}: is a share between 0 and 1")
+        if self.segments_more < 0:
+            raise ConfigError(f"validation.segments_more={self.segments_more}: must not be negative")
+        if self.calibration_images < 1:
+            raise ConfigError(f"validation.calibration_images={self.calibration_images}: must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -114,6 +120,8 @@ class ImproveSettings:
     # share of the way from the weights that a round starts from to those that the recipe `held` has trained from them,
     # which is gone: with most of what was learned here goes less of what was known of other places
     way: float = 0.8
+    # then, in all rounds but the first, of the way from the weights that the loop started from
+    later_way: float = 0.9
     metric: MetricSettings = field(default_factory=MetricSettings)  # of the recipe `metric`, and of that
     training: OdometryTrainingSettings = field(  # of the recipe `tracks`
         default_factory=lambda: OdometryTrainingSettings(
@@ -128,8 +136,9 @@ class ImproveSettings:
         for name in ("minutes", "steps_per_frame"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ConfigError(f"{name}={getattr(self, name):g}: must be 0 or more")
-        if not 0 < self.way <= 1:
-            raise ConfigError(f"way={self.way:g}: must be above 0 and at most 1")
+        for name in ("way", "later_way"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ConfigError(f"{name}={getattr(self, name):g}: must be above 0 and at most 1")
         if self.minutes and self.recipe != HELD:
             raise ConfigError("minutes: only the recipe `held` chooses its steps by time; give steps instead")
 

@@ -33,6 +33,7 @@ from improvo.labeling.store import (
 )
 from improvo.locations import LOCATION_ERRORS, folder_here, lock_files, looked_up, refresh, url_of
 from improvo.odometry.run_settings import RunSettings
+from improvo.sequences.content import content_of
 from improvo.sequences.given_files import contents_of_given, with_absolute_files
 
 logger = logging.getLogger(__name__)
@@ -115,6 +116,8 @@ def label_sequences(
     names = sequence_names(list(paths), stored)
     before = {record.name: record for record in stored if record.state == DONE}
     records = {name: before[name] for name in names if name in before}
+    for name, record in records.items():
+        _refuse_changed(names[name], record, folder / name, settings)
     for record in records.values():
         on_record(record)
     url = url_of(store.folder)
@@ -202,6 +205,7 @@ def _labeled(job: LabelJob, tick: Tick) -> SequenceRecord:
 
     started = time.perf_counter()
     sequence = open_sequence(job.path, job.settings.sequence)
+    content = content_of(sequence.recording)  # what it was before
     labeled = run_and_label(sequence, job.folder, job.settings, "label", progress=lambda view: tick())
     report, quality, trajectory = labeled.report, labeled.quality, labeled.trajectory
     if report["interrupted"]:
@@ -226,6 +230,7 @@ def _labeled(job: LabelJob, tick: Tick) -> SequenceRecord:
         withheld=counts["withheld"],
         packed=job.pack,
         seconds=round(time.perf_counter() - started, 3),
+        content=content,
     )
     if counts["stable"] + counts["unstable"] == 0:
         why = f"{job.path}: no track has a label ({_why_none(quality.counts(), counts)}); {_MEND}"
@@ -244,6 +249,21 @@ def _labeled(job: LabelJob, tick: Tick) -> SequenceRecord:
         except OSError as error:
             raise OutputError(f"{job.folder}: the frames cannot be packed ({error}); choose another folder") from None
     return replace(record, seconds=round(time.perf_counter() - started, 3))
+
+
+def _refuse_changed(path: Path, record: SequenceRecord, folder: Path, settings: RunSettings) -> None:
+    """Refuse labels of what was there under this path before.
+
+    Raises:
+        InputError: the recording is another one than was labelled.
+    """
+    from improvo.sequences import open_recording
+
+    if record.content and content_of(open_recording(path, settings.sequence)) != record.content:
+        raise InputError(
+            f"{path}: is not what {folder} was made from, it has changed since; remove that folder, and it is made "
+            "again, or choose another output folder"
+        )
 
 
 def _stored(store: LabelStore, job: LabelJob, result: SequenceRecord | Exception) -> SequenceRecord:

@@ -71,6 +71,7 @@ class SequenceRecord:
     withheld: int = 0  # labels that the quality gate took away
     packed: bool = False
     seconds: float = 0.0
+    content: str = ""  # of the recording, see `improvo.sequences.content`; earlier versions did not write it
 
 
 class LabelStore:

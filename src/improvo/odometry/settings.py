@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from improvo.backend.settings import ObjectiveSettings
-from improvo.config import SEEDS
+from improvo.config import check_seed
 from improvo.errors import ConfigError
 
 
@@ -20,7 +20,9 @@ class MatchingSettings:
     flow_outlier_limit: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.flow_outlier_limit >= 0:
+        if not self.max_distance > 0:
+            raise ConfigError(f"matching.max_distance={self.max_distance}: must be positive; 0.7 is the paper's")
+        if not 0 <= self.flow_outlier_limit <= 1:
             raise ConfigError(
                 f"flow_outlier_limit={self.flow_outlier_limit}: is a share of the image width, 0 for no limit"
             )
@@ -68,6 +70,10 @@ class TrackingLossSettings:
     """When a segment counts as lost."""
 
     max_lost_frames: int = 10  # more frames than this without a pose end the segment
+
+    def __post_init__(self) -> None:
+        if self.max_lost_frames < 0:
+            raise ConfigError(f"loss.max_lost_frames={self.max_lost_frames}: must not be negative (0: the first one)")
 
 
 @dataclass(frozen=True)
@@ -143,8 +149,7 @@ class OdometrySettings:
     def __post_init__(self) -> None:
         if self.mode not in ("robust", "paper"):
             raise ConfigError(f"mode {self.mode!r}: choose `robust` or `paper`")
-        if not 0 <= self.seed < SEEDS:
-            raise ConfigError(f"seed={self.seed}: must be 0 or more, and less than {SEEDS}")
+        check_seed(self.seed)
         if not self.tolerance > 0:
             raise ConfigError(f"tolerance={self.tolerance}: is pixels, and must be positive")
 

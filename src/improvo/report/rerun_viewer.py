@@ -5,6 +5,9 @@ Entities are named as in Rerun's own SLAM examples: `world/points`, `world/camer
 
 from __future__ import annotations
 
+import os
+import shutil
+import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -23,6 +26,7 @@ from improvo.report.palettes import PALETTES, Palette
 from improvo.stability.rule import IGNORE
 from improvo.types import Float64, Frame, UInt8
 
+_PROGRAM = "rerun"
 _OLD = 30  # frames; the last colour of the age of a track
 _MAP_EVERY = 10  # frames between two pictures of the whole map, at least
 _MAP_GROWTH = 1.1  # of its points between two such pictures: all of them together stay a few times the last one
@@ -167,6 +171,11 @@ def _times(run: RunFolder) -> Float64:
     return times
 
 
+def _program_path() -> str:
+    """Where programs are looked for: also beside this Python, whose folder is in no PATH unless it was activated."""
+    return os.pathsep.join([os.environ.get("PATH", os.defpath), str(Path(sys.executable).parent)])
+
+
 class _Recording:
     """Rerun's recording stream, in our nouns."""
 
@@ -176,6 +185,10 @@ class _Recording:
             check_output_file(save, (".rrd",))
             if not save.absolute().parent.is_dir():
                 raise OutputError(f"{save}: no folder {save.parent}; make it first")
+        elif shutil.which(_PROGRAM, path=_program_path()) is None:
+            raise OutputError(
+                f"the live viewer: no program `{_PROGRAM}` is found; install it, or save a file to open later"
+            )
         self._rerun: Any = rerun
         self._save = save
         self._files = ExitStack()
@@ -184,7 +197,12 @@ class _Recording:
     def open(self, camera: Camera) -> None:
         self._stream = self._rerun.RecordingStream("improvo")
         if self._save is None:
-            self._stream.spawn()
+            os.environ["PATH"] = _program_path()
+            try:
+                self._stream.spawn()
+            except RuntimeError as error:
+                said = str(error).splitlines()[0]
+                raise OutputError(f"the live viewer does not start ({said}); save a file, and open it later") from None
         else:
             self._stream.save(str(self._files.enter_context(written_atomically(self._save))))
         self._log("world", self._rerun.ViewCoordinates.RDF, static=True)

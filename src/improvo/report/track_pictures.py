@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from improvo.errors import ConfigError
 from improvo.odometry.run_folder import RunFolder
 from improvo.report.canvas import Canvas
 from improvo.report.palettes import PALETTES, Palette
@@ -28,6 +29,10 @@ class TrackPictureSettings:
     large_error: float = 3.0  # pixels; residuals of this size and more have the last colour
     palette: Palette = PALETTES["paper"]
     width: int = 1280  # small frames are enlarged to about this
+
+    def __post_init__(self) -> None:
+        if min(self.tail, self.min_age) < 0 or min(self.old, self.width) < 1 or not self.large_error > 0:
+            raise ConfigError("track pictures: tail and min_age must be 0 or more, old, width and large_error positive")
 
 
 def paint_tracks(run: RunFolder, frame: int, settings: TrackPictureSettings | None = None) -> UInt8:

@@ -8,21 +8,24 @@ from itertools import pairwise
 import numpy as np
 
 from improvo.errors import InputError
-from improvo.geometry.alignment import align_points
+from improvo.evaluation.settings import TrajectorySettings
+from improvo.evaluation.trajectory.protocol import aligned_segments, clean_truth, total_errors
 from improvo.odometry.run_folder import RunFolder
-from improvo.types import Float64, Int64
+from improvo.types import Float64, Int64, Trajectory
 
 _GAP = 10  # poses from one with truth to the next, which a line may bridge
-_FEWEST = 3  # poses of a segment that an alignment needs
 
 
 @dataclass(frozen=True)
 class TruePath:
-    """True camera centers, one row for each pose of the run, each segment aligned on its own (rotation, scale)."""
+    """True camera centers, one row for each pose of the run.
+
+    Each segment of the run is aligned with the truth on its own (Sim3), as `improvo evaluate trajectory` does, and the
+    truth is carried back into the run's world by the inverse, so that both give the same figures.
+    """
 
     centers: Float64  # (N, 3) in the world of the run, NaN where there is no truth
-    errors: Float64  # (N,) distance of the estimate, in the run's unit
-    ate_percent: float  # root mean square of the errors over the length of the true path
+    ate_percent: float  # root mean square distance over the length of the true path
     segment: Int64  # (N,) of each pose
 
     def drawn(self) -> Float64:
@@ -54,18 +57,17 @@ def true_path(run: RunFolder) -> TruePath | None:
     if truth is None or len(trajectory) == 0:
         return None
     rows = np.searchsorted(run.sequence.indices, np.array(run.source_index)[run.frame_indices])
-    wanted = truth.camera_centers[np.minimum(rows, len(truth) - 1)]
-    centers, length = np.full_like(wanted, np.nan), 0.0
-    known = np.isfinite(wanted).all(axis=1)
-    for segment in np.unique(trajectory.segment).tolist():
-        here = np.flatnonzero((trajectory.segment == segment) & known)
-        estimate = trajectory.camera_centers[here]
-        if len(here) < _FEWEST or np.ptp(wanted[here], axis=0).max() == 0 or np.ptp(estimate, axis=0).max() == 0:
-            continue
-        centers[here] = align_points(estimate, wanted[here], with_scale=True).apply(wanted[here])
-        # from one known place to the next, also where there is no truth between them
-        length += float(np.linalg.norm(np.diff(centers[here], axis=0), axis=1).sum())
-    errors = np.linalg.norm(trajectory.camera_centers - centers, axis=1)
-    if not np.isfinite(errors).any() or length == 0:
+    wanted = truth.world_from_cam[np.minimum(rows, len(truth) - 1)]
+    clean = clean_truth(Trajectory(trajectory.times, wanted))[0]
+    if not (clean.valid.any() and trajectory.valid.any()):
         return None
-    return TruePath(centers, errors, 100.0 * float(np.sqrt(np.nanmean(errors**2))) / length, trajectory.segment)
+    segments = aligned_segments(trajectory, clean, TrajectorySettings(time_windows=(), path_fractions=()))
+    aligned = [each for each in segments if each.motion is not None and each.motion.scale > 0]
+    total = total_errors(aligned)
+    if total.ate_percent is None:
+        return None
+    centers = np.full((len(trajectory), 3), np.nan)
+    for segment in aligned:
+        assert segment.motion is not None
+        centers[segment.rows] = segment.motion.inverse().apply(segment.truth[:, :3, 3])
+    return TruePath(centers, total.ate_percent, trajectory.segment)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -11,18 +10,19 @@ from typing import Any, TypeVar
 
 from improvo.config import to_dict
 from improvo.errors import ConfigError, InputError
-from improvo.files import write_json, write_text
+from improvo.files import content_hash, write_json, write_text
 from improvo.odometry.run import RunSummary
 from improvo.self_calibration.from_motion import CameraFromMotion, Told, camera_from_motion
 from improvo.self_calibration.settings import SelfCalibrationSettings
-from improvo.sequences.base import Recording, SequenceSettings
+from improvo.sequences.base import SequenceSettings
+from improvo.sequences.content import content_of
+from improvo.sequences.given_files import mask_content
 from improvo.sequences.opening import open_recording
 from improvo.sequences.rates import AUTO, recording_name
 from improvo.untrusted.text import read_json_file
 
 SINGLE, FOLDER = "camera.yaml", "cameras"
 _IRRELEVANT = ("camera", "fov", "undistorted_fov", "width")  # of how a recording is read
-_PICTURES = "pictures"
 Run = TypeVar("Run", bound=RunSummary)
 
 
@@ -115,9 +115,7 @@ def _is_of(camera: Path, request: dict[str, Any]) -> bool:
     side = camera.with_suffix(".json")
     if not (camera.is_file() and side.is_file()):
         return False
-    known = read_json_file(side, "delete it").get("request")
-    former = {name: value for name, value in request.items() if name != _PICTURES}  # was not written at first
-    return known in (request, former)
+    return bool(read_json_file(side, "delete it").get("request") == request)
 
 
 def _request(path: Path, settings: SelfCalibrationSettings) -> dict[str, Any]:
@@ -126,20 +124,8 @@ def _request(path: Path, settings: SelfCalibrationSettings) -> dict[str, Any]:
     how["sequence"] = {name: value for name, value in how["sequence"].items() if name not in _IRRELEVANT}
     recording = open_recording(path, settings.sequence)
     what = {"recording": str(path.absolute()), "frames": len(recording), "settings": how}
-    if path.is_file():
-        what |= {"bytes": path.stat().st_size}
-    elif len(recording):
-        what |= {_PICTURES: _digest(recording)}
+    what |= {"content": content_of(recording), "mask_content": mask_content(settings.sequence)}
+    weights = Path(settings.frontend.name)
+    if weights.suffix == ".safetensors" and weights.is_file():
+        what |= {"weights": content_hash(weights)}
     return dict(json.loads(json.dumps(what)))
-
-
-def _digest(recording: Recording) -> str:
-    """Of three pictures: a folder of the same name may hold another recording by now."""
-    digest = hashlib.blake2b(digest_size=16)
-    for index in sorted({0, len(recording) // 2, len(recording) - 1}):
-        try:
-            picture = recording.image(index)
-        except InputError:  # this frame is damaged
-            continue
-        digest.update(str(picture.shape).encode() + picture.tobytes())
-    return digest.hexdigest()

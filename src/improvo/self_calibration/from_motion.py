@@ -203,6 +203,7 @@ def lens_of_pieces(
     )
 
 
+_BETTER_THAN_A_GUESS = 0.1  # of the focal length; what one guesses of a phone's is 10 to 15 % off
 _ADVICE = "walk sideways and turn past things near and far, or give --fov DEGREES or --camera FILE"
 
 
@@ -287,11 +288,15 @@ def refuse_unsure(result: CameraFromMotion, name: str, settings: SelfCalibration
             f"{name}: its motion does not tell its camera (the distortion found has no inverse); {_ADVICE}"
         )
     if not result.focal_deviation <= settings.max_focal_deviation:  # nor where it is NaN
-        raise InputError(
-            f"{name}: its motion leaves the focal length open: {result.camera.fx:.0f} px +- "
-            f"{100 * result.focal_deviation:.1f} %, where {100 * settings.max_focal_deviation:.0f} % is the limit "
-            f"(max_focal_deviation); {_ADVICE}"
-        )
+        found, advice = "no focal length fits better than another", _ADVICE
+        if result.focal_deviation < 1:
+            found = (
+                f"{result.camera.fx:.0f} px +- {100 * result.focal_deviation:.1f} %, where "
+                f"{100 * settings.max_focal_deviation:.2g} % is the limit (max_focal_deviation)"
+            )
+        if result.focal_deviation < _BETTER_THAN_A_GUESS:
+            advice = f"--fov {result.fov:.0f} takes it all the same; or {_ADVICE}"
+        raise InputError(f"{name}: its motion leaves the focal length open: {found}; {advice}")
     if not result.rms <= settings.max_rms:
         raise InputError(
             f"{name}: no camera explains it: points miss their places by {result.rms:.1f} px; its zoom or focus "

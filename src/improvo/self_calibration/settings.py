@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from improvo.config import check_seed
 from improvo.errors import ConfigError
 from improvo.frontend.settings import FrontendSettings
 from improvo.odometry.settings import OdometrySettings
@@ -38,3 +39,7 @@ class SelfCalibrationSettings:
                 raise ConfigError(f"setting `{name}`: must be at least {minimum}, not {getattr(self, name)}")
         if not 0 < self.max_focal_deviation < 1:
             raise ConfigError(f"max_focal_deviation={self.max_focal_deviation}: is a share between 0 and 1")
+        for name in ("max_rate", "max_rms"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"setting `{name}`: must be above 0, not {getattr(self, name)}")
+        check_seed(self.seed)

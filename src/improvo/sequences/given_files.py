@@ -29,8 +29,13 @@ def contents_of_given(settings: SequenceSettings) -> dict[str, str]:
     camera = settings.camera or ""
     return {
         "camera_content": _FOLDER_OF_CAMERAS if camera and Path(camera).is_dir() else _content(camera),
-        "mask_content": _content(settings.mask or ""),
+        "mask_content": mask_content(settings),
     }
+
+
+def mask_content(settings: SequenceSettings) -> str:
+    """The entry `mask_content` of `contents_of_given` alone."""
+    return _content(settings.mask or "")
 
 
 def _absolute(given: str | None) -> str | None:

@@ -2,11 +2,16 @@
 
 Time stamps are frame numbers at 30 Hz. The published poses are those of a camera whose y axis points up, as the
 negative fy of its intrinsics says; they are reflected here, so that K is ordinary and rotations stay rotations.
+
+Many copies call the trajectory `groundtruth.txt`, as TUM RGB-D does. Read as TUM RGB-D, its rotations would be those of
+a mirror image. Such a copy is known by its frame numbers in the place of times, and by its first pose, which all of the
+data set's trajectories share but for the distance: `1 0 0 -2.25 0 0 0 1`.
 """
 
 from __future__ import annotations
 
 import re
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +29,12 @@ from improvo.untrusted.names import number_of
 
 DEPTH_SCALE = 5000.0
 FPS = 30.0
+_HEADER = 20  # lines of comments before the first pose, at most
 _UP_TO_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 class IclNuim(Recording):
-    """A folder with `rgb`, `depth` and a `*.gt.freiburg` file."""
+    """A folder with `rgb`, `depth` and a `*.gt.freiburg` file, which may be named `groundtruth.txt`."""
 
     format = "icl"
 
@@ -46,7 +52,7 @@ class IclNuim(Recording):
         published = Calibration("ICL-NUIM", (481.2, 480.0, 319.5, 239.5), size=(640, 480))
         self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: published)
         self._scale = depth_scale(self.calibration, settings, path) or DEPTH_SCALE
-        truth = next(iter(sorted(path.glob("*.gt.freiburg"))), None)
+        truth = next(iter(sorted(path.glob("*.gt.freiburg"))), path / "groundtruth.txt" if _is_renamed(path) else None)
         if truth is not None:
             poses_up, problems = read_trajectory_report(truth, "tum")
             self.notes += problems
@@ -55,7 +61,7 @@ class IclNuim(Recording):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        return path.is_dir() and (path / "rgb").is_dir() and any(path.glob("*.gt.freiburg"))
+        return path.is_dir() and (path / "rgb").is_dir() and (any(path.glob("*.gt.freiburg")) or _is_renamed(path))
 
     def source(self, index: int) -> str:
         return str(self._images.files[index])
@@ -87,6 +93,21 @@ def _associations(path: Path) -> dict[int, tuple[Path, Path | None]]:
             if (number := number_of(file.stem)) is not None:
                 frames[number] = (file, path / "depth" / f"{file.stem}.png")
     return frames
+
+
+def _is_renamed(path: Path) -> bool:
+    """Whether `groundtruth.txt` is a trajectory of this data set."""
+    truth = path / "groundtruth.txt"
+    if not (truth.is_file() and (path / "associations.txt").is_file()) or (path / "rgb.txt").is_file():
+        return False
+    with truth.open(encoding="utf-8", errors="replace") as file:
+        first = next((line for line in islice(file, _HEADER) if line.strip() and not line.startswith("#")), "")
+    try:
+        stamp, x, y, z, *quat_xyzw = (float(field) for field in first.split())
+    except ValueError:
+        return False
+    numbered = all(number_of(image.stem) == number for number, (image, _) in _associations(path).items())
+    return numbered and stamp in (0, 1) and x == y == 0 > z and quat_xyzw == [0, 0, 0, 1]
 
 
 def _is_number(text: str) -> bool:

@@ -1,5 +1,8 @@
 """KITTI odometry (Geiger et al. 2012): `calib.txt`, `times.txt`, `image_0` (grey) or `image_2` (colour), poses.
 
+Courses hand out shortened copies whose folders are `image_l` and `image_r` and whose `calib.txt` is a row of twelve
+numbers a camera, without names.
+
 Poses are those of camera 0: `poses.txt` in the folder, or `poses/NN.txt` beside the `sequences` folder. The pose of
 another camera follows from its projection matrix, which is K [I | t].
 """
@@ -21,7 +24,7 @@ from improvo.sequences.images import list_images
 from improvo.types import Float64, Trajectory, UInt8
 
 FPS = 10.0
-_CAMERAS = (0, 2, 1, 3)
+_CAMERAS = {"image_0": 0, "image_2": 2, "image_1": 1, "image_3": 3, "image_l": 0, "image_r": 1}  # folder: number
 
 
 class KittiOdometry(Recording):
@@ -31,10 +34,11 @@ class KittiOdometry(Recording):
 
     def __init__(self, path: Path, settings: SequenceSettings) -> None:
         self.path = path
-        number = next((n for n in _CAMERAS if _has_images(path / f"image_{n}")), None)
-        if number is None:
+        folder = next((name for name in _CAMERAS if _has_images(path / name)), None)
+        if folder is None:
             raise InputError(f"{path}: has no images in image_0 or image_2, so it is no KITTI odometry sequence")
-        files = list_images(path / f"image_{number}")
+        number = _CAMERAS[folder]
+        files = list_images(path / folder)
         notes: list[str] = []
         order = np.arange(len(files))
         if (path / "times.txt").is_file() and settings.fps is None:
@@ -72,7 +76,7 @@ class KittiOdometry(Recording):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        return (path / "calib.txt").is_file() and any(_has_images(path / f"image_{n}") for n in _CAMERAS)
+        return (path / "calib.txt").is_file() and any(_has_images(path / name) for name in _CAMERAS)
 
     def source(self, index: int) -> str:
         return str(self._images.files[index])
@@ -95,6 +99,7 @@ def _read_calibration(path: Path, number: int) -> tuple[Calibration, Float64]:
     try:
         lines = read_text(path, "a calibration").splitlines()
         rows = {line.split(":")[0].strip(): line.split(":", 1)[1].split() for line in lines if ":" in line}
+        rows = rows or {f"P{camera}": line.split() for camera, line in enumerate(filter(str.strip, lines))}
         row = rows.get(f"P{number}", rows.get(f"P_rect_0{number}"))
         projection = np.array(row or [], np.float64).reshape(3, 4)
         cam_from_cam0 = rigid(np.eye(3), np.linalg.solve(projection[:, :3], projection[:, 3]).astype(np.float64))

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,15 @@ from improvo.errors import ConfigError, InputError
 from improvo.files import never_replace
 from improvo.sequences.association import poses_at
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
-from improvo.sequences.images import IMAGE_SUFFIXES
+from improvo.sequences.images import IMAGE_SUFFIXES, natural_key
 from improvo.sequences.live import LiveStream, is_live
 from improvo.sequences.live_sequence import LiveSequence
 from improvo.sequences.sequence import Sequence, selected
 from improvo.sequences.video_codec import has_sound_alone
 from improvo.types import Trajectory
-from improvo.untrusted.paths import check_path
+from improvo.untrusted.paths import check_path, check_readable
 
+_LOOKED_AT, _NAMED = 200, 4  # entries of a folder that is no recording, and of those that are named
 ENTRY_POINT = "improvo.recordings"  # the group under which other packages offer their readers
 
 # format -> class; tried in this order: the most specific layouts first, the plain image folder last
@@ -80,7 +82,7 @@ def true_trajectory(path: Path | str, settings: SequenceSettings | None = None, 
 def open_recording(path: Path | str, settings: SequenceSettings | None = None, **overrides: Any) -> Recording:
     """The recording as it lies on disk: raw images, needs no calibration. Arguments and errors as `open_sequence`."""
     settings = _with_overrides(settings, overrides)
-    path = check_path(Path(path))
+    path = check_readable(check_path(Path(path)))
     if settings.fps is not None and not 1e-6 <= settings.fps <= 1e6:
         raise InputError(f"{path}: fps {settings.fps:g} is no number of frames a second; between 1e-06 and 1e+06")
     try:
@@ -122,7 +124,27 @@ def _why_unrecognised(path: Path) -> str:
     other = _unread_pictures(path)
     if other is not None:
         return f"holds {other} files, which are not read; convert them to JPEG or PNG"
+    inside = _recordings_in(path)
+    if inside:
+        names = ", ".join(inside[:_NAMED]) + (", ..." if len(inside) > _NAMED else "")
+        return f"is no recording itself but holds {names}; give {'that' if len(inside) == 1 else 'one of these'}"
     return f"not recognised as any of {', '.join(format_names())}; name it with --format if it is one"
+
+
+def _recordings_in(folder: Path) -> list[str]:
+    """Names of what a folder holds that some reader takes."""
+    entries = (
+        sorted(islice(folder.iterdir(), _LOOKED_AT), key=lambda path: natural_key(path.name)) if folder.is_dir() else []
+    )
+    found = []
+    for entry in entries:
+        try:
+            taken = not entry.name.startswith(".") and any(recording.recognises(entry) for recording in _formats())
+        except OSError:  # a folder that may not be read
+            continue
+        if taken:
+            found.append(entry.name)
+    return found
 
 
 def _unread_pictures(path: Path) -> str | None:

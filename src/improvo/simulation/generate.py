@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 
 from improvo.config import to_dict
-from improvo.files import make_output_folder, write_json, written_atomically
+from improvo.files import write_json, written_atomically
+from improvo.folder_lock import working_in
 from improvo.geometry.camera import Camera
 from improvo.jobs.pool import Workers
 from improvo.simulation.causes import Cause, cause_image
@@ -79,23 +80,23 @@ def simulate(
         progress: called after every frame.
 
     Raises:
-        OutputError: the folder holds something else, or cannot be written.
+        OutputError: the folder holds something else, cannot be written, or another process is at work there.
     """
-    make_output_folder(folder, "simulate")
-    (folder / "labels").mkdir(exist_ok=True)
-    camera: Camera = camera_of(settings.width, settings.height, settings.fov)
-    about = {
-        "settings": to_dict(settings),
-        "causes": {cause.name.lower(): int(cause) for cause in Cause},
-        "labels": "labels/NNNNNN.png, the cause of instability per pixel, named like the images",
-    }
-    write_json(folder / "simulation.json", about)
-    with TumRgbdWriter(folder, camera, settings.fps, jpeg_quality=jpeg_quality) as writer:
-        for number, frame in enumerate(simulated_frames(settings)):
-            _write_labels(folder / "labels" / f"{number:06d}.png", frame.causes)
-            depth = frame.depth if number % depth_every == 0 else None
-            writer.add(frame.time, frame.image, depth, frame.world_from_cam)
-            progress()
+    with working_in(folder, "simulate"):
+        (folder / "labels").mkdir(exist_ok=True)
+        camera: Camera = camera_of(settings.width, settings.height, settings.fov)
+        about = {
+            "settings": to_dict(settings),
+            "causes": {cause.name.lower(): int(cause) for cause in Cause},
+            "labels": "labels/NNNNNN.png, the cause of instability per pixel, named like the images",
+        }
+        write_json(folder / "simulation.json", about)
+        with TumRgbdWriter(folder, camera, settings.fps, jpeg_quality=jpeg_quality) as writer:
+            for number, frame in enumerate(simulated_frames(settings)):
+                _write_labels(folder / "labels" / f"{number:06d}.png", frame.causes)
+                depth = frame.depth if number % depth_every == 0 else None
+                writer.add(frame.time, frame.image, depth, frame.world_from_cam)
+                progress()
 
 
 def simulate_many(
@@ -112,11 +113,10 @@ def simulate_many(
     Returns:
         Their folders. `progress` is called after every recording.
     """
-    make_output_folder(folder, "simulate")
     jobs = [replace(settings, seed=settings.seed + number) for number in range(scenes)]
     targets = [folder / f"scene-{job.seed:04d}" for job in jobs]
     tasks = [(job, target, jpeg_quality, depth_every) for job, target in zip(jobs, targets, strict=True)]
-    with Workers(workers) as pool:
+    with working_in(folder, "simulate"), Workers(workers) as pool:
         for _ in pool.run(_simulate_alone, tasks, "simulate"):
             progress()
     return targets

@@ -117,6 +117,7 @@ class SceneRenderer:
 def _import_mujoco() -> ModuleType:
     if sys.platform == "linux" and "MUJOCO_GL" not in os.environ and "DISPLAY" not in os.environ:
         os.environ["MUJOCO_GL"] = "osmesa" if ctypes.util.find_library("OSMesa") else "egl"
+    os.environ.setdefault("MESA_SHADER_CACHE_DISABLE", "true")  # in a folder of the user that is none of our business
     try:
         mujoco: ModuleType = imported("mujoco", "simulate", "simulate")
     except (AttributeError, RuntimeError, OSError) as error:

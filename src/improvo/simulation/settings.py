@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+from improvo.config import check_seed
 from improvo.errors import ConfigError
 
 _FROM_ZERO = (
@@ -75,6 +76,7 @@ class SimulationSettings:
             raise ConfigError(f"setting `room_height`: {self.room_height} must lie between 2.3 and 6 metres")
         if not 3.5 <= min(self.room_size) <= max(self.room_size) <= 12:
             raise ConfigError(f"setting `room_size`: {self.room_size} must lie between 3.5 and 12 metres")
+        check_seed(self.seed)
 
 
 _PRESETS: dict[str, dict[str, Any]] = {

@@ -104,7 +104,9 @@ class TumRgbdWriter:
         self._last_time = time
 
     def close(self) -> None:
-        """Write the lists of the frames so far."""
+        """Write the lists of the frames so far; without a frame there is no recording, and no list of it."""
+        if not self._images:
+            return
         write_text(self.folder / "rgb.txt", "# timestamp filename\n" + "".join(self._images))
         if self._depth:
             write_text(self.folder / "depth.txt", "# timestamp filename\n" + "".join(self._depth))

@@ -21,6 +21,14 @@ class LabelQualitySettings:
     def __post_init__(self) -> None:
         if not self.max_median_error > 0:
             raise ConfigError(f"max_median_error={self.max_median_error}: must be positive")
+        if not 0 <= self.min_median_parallax_deg <= 180:
+            raise ConfigError(
+                f"min_median_parallax_deg={self.min_median_parallax_deg}: is an angle of 0 to 180 degrees"
+            )
+        if self.doubted_before_contradiction < 0:
+            raise ConfigError(
+                f"doubted_before_contradiction={self.doubted_before_contradiction}: is frames, and not negative"
+            )
         if not 0 <= self.min_trusted_share <= 1:
             raise ConfigError(f"min_trusted_share={self.min_trusted_share}: must be between 0 and 1")
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from improvo.config import check_seed
 from improvo.errors import ConfigError, InputError
 from improvo.frontend.weights import Weights
 from improvo.training.setting_checks import Checks
@@ -47,6 +48,7 @@ class MetricSettings:
         checks.at_least(50, "max_keypoints")
         checks.at_least(16, "longer_side")
         checks.positive("right_px", "masked_px")
+        check_seed(self.seed)
         if not 0 < self.shrinkage <= 1:
             raise ConfigError(f"setting `shrinkage`: must be above 0 and at most 1, not {self.shrinkage}")
 

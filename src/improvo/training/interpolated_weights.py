@@ -6,6 +6,7 @@ fine-tuning of zero-shot models", CVPR 2022): they are those of one network, and
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,15 +42,20 @@ def interpolated(start: Weights, trained: Weights, share: float) -> Weights:
     return Weights(card, with_dead_channels(mixed, card.architecture))
 
 
-def write_interpolated(start: Path, trained: Path, share: float, output: Path) -> None:
-    """See `interpolated`; the card of the file says of which weights it is the mean.
+def write_interpolated(starts: Sequence[tuple[Path, float]], trained: Path, output: Path) -> None:
+    """See `interpolated`, one after the other; the card of the file says of which weights it is the mean.
+
+    Args:
+        starts: weights, and the share of the way from these.
+        trained: weights that the first way leads to; each other one leads to where the one before it has ended.
+        output: weights file to write.
 
     Raises:
         InputError: weights that cannot be read, or between which nothing lies.
     """
-    result = interpolated(load_weights(start), load_weights(trained), share)
-    training = {
-        **result.card.training,
-        "interpolated": {"start": start.name, "start_sha256": files.content_hash(start), "share": share},
-    }
+    result = load_weights(trained)
+    for start, share in starts:
+        result = interpolated(load_weights(start), result, share)
+    ends = [{"start": start.name, "start_sha256": files.content_hash(start), "share": share} for start, share in starts]
+    training = {**result.card.training, "interpolated": ends}
     save_weights(output, result.tensors, replace(result.card, training=training))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 from pathlib import Path
 
 from improvo.errors import InputError
@@ -46,4 +47,19 @@ def check_path(path: Path, reachable: bool = False) -> Path:
             raise InputError(f"{shown}: {_REASONS[error.errno]}; check the path") from None
         if reachable and isinstance(error, PermissionError):
             raise InputError(f"{path}: no permission to look into its folder; choose another, or change that") from None
+    return path
+
+
+def check_readable(path: Path) -> Path:
+    """The path, unless something is there that this process may not read; readers would call it damaged, or missing.
+
+    Raises:
+        InputError: no permission.
+    """
+    try:
+        is_folder = stat.S_ISDIR(os.stat(path).st_mode)
+    except (OSError, ValueError):  # not there, or in a folder that may not be looked into: for others to say
+        return path
+    if not os.access(path, os.R_OK | os.X_OK if is_folder else os.R_OK):
+        raise InputError(f"{path}: no permission to read it; choose another, or change that")
     return path

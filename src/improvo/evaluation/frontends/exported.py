@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePath
@@ -48,15 +49,15 @@ class ExportedFeatures:
         _index(self.path)
 
     def fingerprint(self) -> dict[str, Any]:
-        """Place and time of the export."""
+        """Place of the export, and names, sizes and times of its files."""
         index = _index(self.path)
         files = [Path(self.path)] if index.hdf5 else [Path(self.path) / name for name in index.names]
-        newest = max(file.stat().st_mtime_ns for file in files)
+        stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in sorted(files)]
         return {
             "exported": self.path,
             "max_keypoints": self.max_keypoints,
             "images": len(index.names),
-            "modified": newest,
+            "files": hashlib.blake2b(repr(stats).encode(), digest_size=16).hexdigest(),
         }
 
     def features(self, sequence: Sequence, frame: Frame) -> Features:

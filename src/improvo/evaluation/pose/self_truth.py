@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from improvo.config import check_seed
 from improvo.errors import ConfigError, InputError
 from improvo.evaluation.measures import PairGeometry, relative_motion
 from improvo.evaluation.pose.protocol import Records, evaluate_pair
@@ -23,6 +24,8 @@ from improvo.evaluation.settings import DEFAULT_ESTIMATORS, PoseSettings
 from improvo.evaluation.statistics import Bootstrap, below
 from improvo.geometry.camera import Camera
 from improvo.types import Features, Float32, Float64, Int64
+
+_FEWEST_BLOCKS = 8
 
 
 @dataclass(frozen=True)
@@ -45,8 +48,9 @@ class SelfTruthSettings:
         if min(self.pairs, self.shuffles, self.resamples, self.min_matches) < 1 or self.max_keypoints < 4:
             raise ConfigError("pairs, shuffles, resamples and min_matches must be at least 1, max_keypoints at least 4")
         limits = (*self.right_px, self.max_rotation_deg, self.max_translation)
-        if min(limits) <= 0 or not 0 < self.confidence < 1:
+        if not (all(limit > 0 for limit in limits) and 0 < self.confidence < 1):
             raise ConfigError("thresholds must be positive, and confidence between 0 and 1")
+        check_seed(self.seed)
 
 
 @dataclass(frozen=True)
@@ -88,6 +92,20 @@ def choose_pairs(run: FixedRun, gap: int, count: int) -> Int64:
     first = first[together & run.has_depth[first]]
     spread = np.unique(np.linspace(0, len(first) - 1, min(count, len(first))).round().astype(np.int64))
     return np.stack([first[spread], first[spread] + gap], axis=1)
+
+
+def overlapping(pairs: Int64) -> int:
+    """How many neighbours of `choose_pairs` (K, 2) are drawn together for an interval.
+
+    As many as lie within one gap: from its first pair to its last, these look at some of the same frames. At most an
+    eighth of all, since the fewer blocks there are, the more alike are the resamples, and the interval would be narrow
+    for want of pairs.
+    """
+    if len(pairs) < 2:
+        return 1
+    spacing = float(np.median(np.diff(pairs[:, 0])))
+    within = int(np.ceil((pairs[0, 1] - pairs[0, 0]) / max(spacing, 1.0)))
+    return max(1, min(within, -(-len(pairs) // _FEWEST_BLOCKS)))
 
 
 def score_pairs(
@@ -146,7 +164,8 @@ def compare(first: PairScores, second: PairScores, settings: SelfTruthSettings) 
         settings: of the intervals.
 
     Returns:
-        For each value `first`, `second`, `difference` (means), and the paired bootstrap `interval` of the difference.
+        For each value `first`, `second`, `difference` (means), and the `interval` of the difference by a paired
+        bootstrap over blocks of neighbouring pairs.
 
     Raises:
         InputError: the pairs are not the same.
@@ -169,7 +188,9 @@ def compare_gaps(
     if not same:
         raise InputError("the two frontends were not scored on the same pairs; score both again")
     bootstraps = [
-        Bootstrap(len(one.pairs), settings.seed + number, settings.resamples, settings.confidence)
+        Bootstrap(
+            len(one.pairs), settings.seed + number, settings.resamples, settings.confidence, overlapping(one.pairs)
+        )
         for number, one in enumerate(first)
     ]
     found: dict[str, dict[str, Any]] = {}

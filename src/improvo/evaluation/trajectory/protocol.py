@@ -98,6 +98,7 @@ class AlignedSegment:
     """Poses of one segment that have a true pose at their time, and the scale that carries them onto it."""
 
     segment: int
+    rows: Int64  # (N,) of the estimate
     times: Float64  # (N,) seconds, of the truth
     truth: Float64  # (N, 4, 4) world_from_cam, metres
     estimate: Float64  # (N, 4, 4) world_from_cam as estimated, not aligned
@@ -144,26 +145,41 @@ def evaluate_trajectory(
     settings = settings or TrajectorySettings()
     clean, unusable = clean_truth(truth)
     segments = aligned_segments(estimate, clean, settings, names)
-    summaries = tuple(segment.summary() for segment in segments)
     aligned = [segment for segment in segments if segment.motion is not None]
-    path = sum(summary.path_m for summary in summaries if summary.ate_m is not None)
-    ate = rotation = None
-    if aligned:
-        distances, angles = zip(*(segment.errors() for segment in aligned), strict=True)
-        ate, rotation = Spread.of(np.concatenate(distances)), Spread.of(np.concatenate(angles))
+    total = total_errors(aligned)
     return TrajectoryErrors(
         alignment=settings.alignment,
         estimate_poses=int(estimate.valid.sum()),
         truth_poses=int(clean.valid.sum()),
         poses=sum(len(segment.times) for segment in segments),
         invalid_truth=tuple(float(time) for time in truth.times[unusable]),
-        path_m=path,
-        ate_m=ate,
-        ate_percent=100.0 * ate.rmse / path if ate and path > 0 else None,
-        rotation_deg=rotation,
-        segments=summaries,
+        path_m=total.path_m,
+        ate_m=total.ate_m,
+        ate_percent=total.ate_percent,
+        rotation_deg=total.rotation_deg,
+        segments=tuple(segment.summary() for segment in segments),
         relative=errors_over_windows(aligned, settings),
     )
+
+
+@dataclass(frozen=True)
+class TotalErrors:
+    """Absolute errors over the poses of several aligned segments."""
+
+    path_m: float  # true
+    ate_m: Spread | None  # None without a segment
+    ate_percent: float | None  # its rmse as a share of the path
+    rotation_deg: Spread | None
+
+
+def total_errors(aligned: list[AlignedSegment]) -> TotalErrors:
+    """Over the poses of all these segments, which all have a motion."""
+    if not aligned:
+        return TotalErrors(0.0, None, None, None)
+    path = sum(float(path_lengths(segment.truth[:, :3, 3])[-1]) for segment in aligned)
+    distances, angles = zip(*(segment.errors() for segment in aligned), strict=True)
+    ate = Spread.of(np.concatenate(distances))
+    return TotalErrors(path, ate, 100.0 * ate.rmse / path if path > 0 else None, Spread.of(np.concatenate(angles)))
 
 
 def aligned_segments(
@@ -199,7 +215,7 @@ def aligned_segments(
         except InputError as error:
             note = str(error)
         times = truth.times[truth_rows[chosen]]
-        segments.append(AlignedSegment(int(segment), times, true_poses, poses, motion, note))
+        segments.append(AlignedSegment(int(segment), estimate_rows[chosen], times, true_poses, poses, motion, note))
     return segments
 
 

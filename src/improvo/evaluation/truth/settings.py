@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from improvo.config import check_seed
 from improvo.errors import ConfigError
 from improvo.sequences.base import SequenceSettings
 
@@ -33,8 +34,10 @@ class TruthSettings:
         if self.calibrate not in CALIBRATE:
             raise ConfigError(f"truth: calibrate `{self.calibrate}` is unknown; choose one of {', '.join(CALIBRATE)}")
         relative = (self.max_disagreement, self.max_scale_spread, self.max_motion_error, self.max_aspect_change)
-        if not 0 < self.min_registered <= 1 or min(self.max_reprojection_px, *relative) <= 0:
+        limits = (self.max_reprojection_px, *relative)
+        if not (0 < self.min_registered <= 1 and all(limit > 0 for limit in limits)):
             raise ConfigError("truth: min_registered must be above 0 and at most 1, the other limits positive")
+        check_seed(self.seed)
 
 
 @dataclass(frozen=True)

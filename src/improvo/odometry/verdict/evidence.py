@@ -34,6 +34,7 @@ _WINDOW = 12  # keyframes that are adjusted together from each part of the evide
 _FEW = 8  # observations or common points; fewer determine nothing
 _THIN = 6  # points seen on both sides of a gap between two keyframes; fewer carry no scale across it
 _UNKNOWN_SCALE = float(np.log(2.0))  # where no point is, the scale of what follows may as well be half or double
+_ROUNDING = 1e-12  # of coordinates, as a share of their size; positions that differ by less are one
 _HASH = 2654435761  # a multiplier of Knuth's, so that the halves of the points are no halves of time or place
 
 
@@ -220,7 +221,13 @@ class EvidenceCheck:
 
 
 def error_percent(path: Float64, reference: Float64) -> float:
-    """Root mean square distance of positions (N, 3) after Sim3, as % of the reference's path."""
+    """Root mean square distance of positions (N, 3) after Sim3, as % of the reference's path.
+
+    Infinite where one of them stands still: Sim3 would shrink any path onto a reference on one spot, and be right.
+    """
+    size = float(np.abs(reference).max(initial=1.0))
+    if np.ptp(reference, axis=0).max() <= _ROUNDING * size:
+        return float("inf")
     length = np.linalg.norm(np.diff(reference, axis=0), axis=1).sum()
     try:
         aligned = align_points(reference, path, with_scale=True).apply(path)

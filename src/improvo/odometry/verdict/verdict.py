@@ -192,6 +192,8 @@ def _uncertain(spread: Spread) -> tuple[tuple[int, int], ...]:
 
 def _in_words(spread: Spread, error: float) -> str:
     """What the estimate rests on, in plain words."""
+    if not np.isfinite(error):
+        return "no error can be estimated: the path, or that of a part of the evidence, stays on one spot"
     quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
     worst = int(np.argmax(quarters))
     words = f"estimated error {error:.1f} % of the path: "

@@ -1,0 +1,45 @@
+"""What is in a recording, for results that are kept: under the same path there may be another one by now."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from improvo.errors import InputError
+from improvo.sequences.base import Recording, UnreadableFrameError
+
+_SAMPLE = 1 << 20  # bytes at the beginning, in the middle and at the end of a file
+_DIGEST_BYTES = 16
+
+
+def content_of(recording: Recording) -> str:
+    """A digest of a recording, hexadecimal, the same wherever it lies; a look at it, not all of its bytes.
+
+    Of a file its size and three samples, among which a video has the places of all its frames. Of a folder its times,
+    the names and sizes of all pictures, and three of them as decoded.
+    """
+    digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
+    if recording.path.is_file():
+        _add_file(digest, recording.path)
+        return digest.hexdigest()
+    digest.update(recording.times.tobytes())
+    for index in range(len(recording)):
+        file = Path(recording.source(index))
+        if file.is_file():
+            digest.update(f"{file.name}\0{file.stat().st_size}\0".encode("utf-8", "surrogateescape"))
+    for index in sorted({0, len(recording) // 2, len(recording) - 1} if len(recording) else ()):
+        try:
+            picture = recording.image(index)
+        except (InputError, UnreadableFrameError):  # this frame is damaged or missing
+            continue
+        digest.update(str(picture.shape).encode() + picture.tobytes())
+    return digest.hexdigest()
+
+
+def _add_file(digest: hashlib.blake2b, path: Path) -> None:
+    size = path.stat().st_size
+    digest.update(str(size).encode())
+    with path.open("rb") as file:
+        for start in sorted({0, max(size // 2 - _SAMPLE // 2, 0), max(size - _SAMPLE, 0)}):
+            file.seek(start)
+            digest.update(file.read(_SAMPLE))
