@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 NO_RESULT = 3  # exit status where everything was read, and no frame has a pose
 _WARNINGS = 5  # printed; run.json has them all
 # kinds of events that other lines say, or that are no alarm
-_UNSAID = ("initialising", "segment", "doubtful", "uncertain", "checked again")
+_UNSAID = ("initialising", "segment", "doubtful", "withdrawn", "uncertain", "checked again")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -77,7 +77,7 @@ def _events(report: dict[str, Any]) -> list[str]:
     if waiting and report["frames"]["lost"]:  # frames that only waited get their pose once the map has begun
         last = waiting[-1]
         lines.append(f"The map could not begin; the last reason, at frame {last['frame_index']}: {last['detail']}.")
-    for kind in ("segment", "doubtful"):  # said by the number of segments, and by their verdicts
+    for kind in ("segment", "doubtful", "withdrawn"):  # said by the number of segments, and by their verdicts
         by_kind.pop(kind, None)
     for kind, events in by_kind.items():
         lines.append(f"{kind.capitalize()} at frame {events[0]['frame_index']}: {events[0]['detail']}.")

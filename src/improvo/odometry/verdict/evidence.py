@@ -207,17 +207,9 @@ class EvidenceCheck:
             path.world_from_cam = path.world_from_cam[-self._overlap :]
 
     def _masks(self, window: EvidenceWindow) -> list[Mask]:
-        """Which observations (O,) belong to each of PARTS.
-
-        A jackknife needs groups of the same size. Where half of a picture is bare, a quarter of its area can have most
-        of the evidence, and what is left without it tells little of the path. So each quarter has a quarter of the
-        observations: the picture is cut at their median, and each half of it at its own.
-        """
-        x, y = window.keypoints.T
-        left = x < np.median(x)
-        upper = np.zeros(len(y), np.bool_)
-        for side in (left, ~left):
-            upper[side] = y[side] < (np.median(y[side]) if side.any() else 0.0)
+        """Which observations (O,) belong to each of PARTS."""
+        left = window.keypoints[:, 0] < 0.5 * self._camera.width
+        upper = window.keypoints[:, 1] < 0.5 * self._camera.height
         half = ((window.ids[window.point] * _HASH) >> 7) & 1 == 0
         return [~(upper & left), ~(upper & ~left), ~(~upper & left), ~(~upper & ~left), half, ~half]
 
