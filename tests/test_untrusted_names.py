@@ -13,6 +13,7 @@ from improvo import config
 from improvo.cli.main import main
 from improvo.continuation import SettingsRecord
 from improvo.errors import ConfigError, ImprovoError, InputError, OutputError
+from improvo.evaluation.truth.reference import lacks_times
 from improvo.files import check_output_folder, write_text
 from improvo.geometry.camera_files import calibration_yaml, load_calibration
 from improvo.geometry.text_files import read_text
@@ -191,6 +192,7 @@ def test_a_pipe_or_a_device_is_never_read(special: str, tmp_path: Path) -> None:
         lambda: config.load(SequenceSettings, tmp_path / "a.yaml"),
         lambda: read_points(tmp_path / "a.parquet"),
         lambda: RunFolder(tmp_path),
+        lambda: lacks_times(tmp_path / "a.txt"),
     ):
         with pytest.raises(ImprovoError, match=words):
             read()
