@@ -30,6 +30,9 @@ MIN_FRAMES = 20  # of a segment, for it to count
 MIN_PATH = 0.02  # metres; without a path, an error has no share of it
 MIN_TRUE = 3  # frames of a segment with a true pose, for it to be compared
 DOUBTS = ("focal length",)  # events that say that the segment may be wrong
+# "Not judged" is neither a claim nor an alarm; a contradiction is one, of the segment as it was with the frames that
+# are taken from it then.
+_NO_DOUBTS = ("not judged", "contradicted")
 RIGHT, WRONG, NONE, IMPOSSIBLE, POSE_OF_NOTHING, UNKNOWN = "R", "w", ".", "x", "X", "?"  # of a frame
 
 
@@ -135,28 +138,28 @@ def run_and_judge(clip: Clip, frontend: Frontend, seed: int) -> Judged:
     """Track a clip, and hold what the odometry says against the truth."""
     truth = clean_truth(Trajectory(clip.times, clip.world_from_cam))[0]
     odometry = VisualOdometry(frontend, clip.camera, OdometrySettings(seed=seed))
-    restarts = []
+    contradictions = []
     before: Trajectory | None = None
     for number, (time, image) in enumerate(zip(clip.times.tolist(), clip.images, strict=True)):
         known = len(odometry.events)
-        if odometry.state is TrackingState.PROVISIONAL and number % STEP_FRAMES == 0:
-            before = odometry.trajectory  # a check may start it anew
+        if odometry.state is not TrackingState.INITIALISING and number % STEP_FRAMES == 0:
+            before = odometry.trajectory  # a check may start it anew, or take its last frames from it
         odometry.track(Frame(number, time, image, f"picture {number}"))
         for event in odometry.events[known:]:
-            if event.kind == "contradiction" and "anew" in event.detail and before is not None:
+            if event.kind == "contradiction" and before is not None:
                 running = int(before.segment.max())
                 error = _error_percent(before, truth, running)[1]
                 turned = _share(_rotation_wrong(before, truth), before, running)
                 right = error is not None and error < RIGHT_PERCENT and turned <= RIGHT_TURNS
-                restarts.append(Alarm(number, event.detail, error, right))
+                contradictions.append(Alarm(number, event.detail, error, right))
     odometry.finish()
     estimate = odometry.trajectory
     rotation_wrong = _rotation_wrong(estimate, truth)
     segments = [_judged(segment, estimate, truth, rotation_wrong, odometry.events) for segment in odometry.segments]
-    alarms = restarts + [
+    alarms = contradictions + [
         Alarm(each.last, each.doubt, each.error_percent, each.right)
         for each in segments
-        if each.doubt and not each.doubt.startswith("not judged")  # which is neither a claim nor an alarm
+        if each.doubt and not each.doubt.startswith(_NO_DOUBTS)
     ]
     return Judged(_frames(clip, estimate, rotation_wrong, segments), segments, alarms, list(odometry.events))
 

@@ -205,18 +205,26 @@ def test_the_control_has_as_many_rounds_and_steps_as_what_is_kept(
 
 
 def test_by_itself_the_loop_ends_with_the_first_round_that_is_not_better(walk: Path, tmp_path: Path) -> None:
-    training, lines = FakeTraining(), list[str]()
+    training, lines = FakeTraining((0.5,)), list[str]()
     out = tmp_path / "out"
     result = run(out, [walk], training, rounds=None, progress=ImprovementProgress(lines.append))
-    assert [candidate.name for candidate in result.candidates] == ["start", "round 1", "round 2"]
-    assert result.kept == (1,)
-    assert any(line.startswith("estimate: ") and line.endswith("a round, up to 3 rounds") for line in lines)
-    assert lines[-1] == "no further round, since the last was not better; --rounds 3 tries once more"
+    assert [candidate.name for candidate in result.candidates] == ["start", "round 1"]
+    assert result.kept == ()
+    assert any(line.startswith("estimate: ") and line.endswith("a round, up to 2 rounds") for line in lines)
+    assert lines[-1] == "no further round, since the last was not better; --rounds 2 tries once more"
     again = FakeTraining()
-    assert run(out, [walk], again, rounds=None).kept == (1,)
+    assert run(out, [walk], again, rounds=None).kept == ()
     assert again.calls == []
-    assert len(run(out, [walk], FakeTraining((0.5,)), rounds=3).candidates) == 4  # asked for, it tries
-    assert len(run(out, [walk], FakeTraining(), rounds=None).candidates) == 4  # and all of it is read again
+    assert run(out, [walk], FakeTraining((0.5, 0.0)), rounds=2).kept == (2,)  # asked for, it tries
+    assert run(out, [walk], again, rounds=None).kept == (2,)  # and all of it is read again
+    assert again.calls == []
+
+
+def test_by_itself_it_makes_two_rounds_where_the_first_is_better(
+    walk: Path, finished: tuple[Improvement, FakeTraining, list[str]], tmp_path: Path
+) -> None:
+    assert len(run(tmp_path / "out", [walk], FakeTraining(), rounds=None).candidates) == 3
+    assert results(tmp_path / "out") == results(finished[0].weights.parent)
 
 
 def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(walk: Path, tmp_path: Path) -> None:

@@ -175,7 +175,7 @@ def test_every_labelling_is_in_the_estimate(changes: dict[str, Any], rounds: int
 
 @pytest.mark.parametrize(
     ("first", "each", "rounds"),
-    [(3, 2, 3), (20, 8, 2), (29, 9, 2), (29, 16, 1), (60, 9, 3), (60, 20, 2)],  # of minutes
+    [(3, 2, 2), (20, 8, 2), (20, 11, 1), (29, 9, 2), (29, 16, 1), (60, 29, 2), (60, 31, 1)],  # of minutes
 )
 def test_rounds_that_are_not_asked_for_take_half_an_hour_or_add_half_to_the_first(
     first: float, each: float, rounds: int, monkeypatch: pytest.MonkeyPatch

@@ -11,10 +11,13 @@ from simulated_features import CAMERA, World, error_percent, hand_motion, nothin
 from improvo.geometry import se3
 from improvo.geometry.a_contrario import disc_probability, log10_false_alarms
 from improvo.geometry.alignment import Similarity
+from improvo.odometry.mapping.bridging import Bridging, Join
 from improvo.odometry.mapping.course import Course
+from improvo.odometry.mapping.former_map import Sighting
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import BridgingSettings, OdometrySettings
 from improvo.odometry.states import TrackingState
+from improvo.odometry.view import View
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.types import Features, Float64, Mask
 
@@ -144,6 +147,71 @@ def test_the_state_is_provisional_until_the_joined_map_is_confirmed() -> None:
     after = [frame for frame in tracked if frame.frame_index >= 50 + GAP and frame.cam_from_world is not None]
     assert {frame.state for frame in after} == {TrackingState.PROVISIONAL}
     assert after[-1].segment == 0
+
+
+class ScriptedMap:
+    """A former map at the origin, in which each view is found with the next scale of a list; at depth 2."""
+
+    number, last_frame = 0, 50
+    shared_from_own = Similarity(1.0, np.eye(3), np.zeros(3))
+
+    def __init__(self, scales: list[float | None]) -> None:
+        self._scales = iter(scales)
+        self.course = Course(np.array([[49.0, 1.63], [50.0, 1.66]]), np.array([[-0.05, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+
+    def sighting(self, view: View, xyz: Float64) -> Sighting | None:
+        scale = next(self._scales)
+        if scale is None:
+            return None
+        assert view.cam_from_world is not None
+        former_pose = np.eye(4)
+        former_pose[0, 3] = 0.01 * (view.frame_index - 50)
+        center = se3.inverse(view.cam_from_world)[:3, 3]
+        placed = Similarity(scale, np.eye(3), former_pose[:3, 3] - scale * center)
+        return Sighting(view.frame_index, placed, 0.005, center, former_pose, depth=2.0, inliers=80)
+
+
+def joins_of(scales: list[float | None]) -> list[Join | None]:
+    """What a new map's keyframes find, six frames apart, where it moves by 0.01 a frame in the former map."""
+    bridging, running, found = Bridging(OdometrySettings()), [], []
+    bridging.remember(ScriptedMap(scales))
+    for i, scale in enumerate(scales):
+        pose = np.eye(4)
+        pose[0, 3] = -0.06 * i / (scale or 1.0)
+        empty = (
+            np.zeros((0, 2)),
+            np.zeros((0, 1), np.float32),
+            np.zeros(0),
+            np.zeros(0, np.int64),
+            np.zeros(0, np.int64),
+        )
+        view = View(60 + 6 * i, (60 + 6 * i) / 30.0, *empty, cam_from_world=pose, keyframe=True)
+        running.append(view)
+        found.append(bridging.look(view, np.zeros((0, 3)), running))
+    return found
+
+
+def test_a_join_takes_the_scale_of_the_newest_sightings_since_a_young_map_changes_its_own() -> None:
+    joins = joins_of([2.5, 2.4, 1.9, 1.6, 1.5, 1.48])
+    assert joins[0] is None
+    scales = [join.shared_from_new.scale for join in joins if join is not None]
+    assert scales[0] == pytest.approx(np.sqrt(2.5 * 2.4))
+    assert scales[-1] == pytest.approx(np.sqrt(1.5 * 1.48))
+    assert joins[-1] is not None
+    assert joins[-1].scale_error < 0.02
+
+
+def test_a_join_that_the_newest_sighting_contradicts_is_known_no_better_than_that() -> None:
+    joins = joins_of([2.5, 2.45, 2.48, 1.4])
+    first, last = joins[2], joins[3]
+    assert first is not None
+    assert last is not None
+    assert last.shared_from_new == first.shared_from_new
+    assert last.scale_error == pytest.approx(np.log(2.465 / 1.4), abs=0.03)  # which makes the segment doubtful
+
+
+def test_a_join_stays_where_the_former_map_is_not_seen_any_more() -> None:
+    assert [join is not None for join in joins_of([2.5, 2.45, None, None])] == [False, True, False, False]
 
 
 def test_two_runs_that_join_give_the_same_bytes() -> None:

@@ -16,7 +16,7 @@ from improvo.odometry.mapping.window import WindowReport
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.segments import Segment, SegmentPlacement
 from improvo.odometry.trajectory_builder import FinalView, TrajectoryBuilder
-from improvo.odometry.verdict.verdict import DOUBTFUL, Verdict
+from improvo.odometry.verdict.verdict import DOUBTFUL, RIGHT, Verdict
 from improvo.odometry.view import View
 from improvo.types import Float64
 
@@ -90,6 +90,14 @@ class TestEvents:
             (9, "doubtful"),
             (22, "uncertain"),
         ]
+
+    def test_a_doubt_that_a_join_takes_away_is_withdrawn(self) -> None:
+        log = EventLog()
+        first = Segment(0, 0, 9, 10, 0.5, "lost", Verdict(DOUBTFUL, 9.0, 0.3, ("bad",)))
+        log.judged(first)
+        log.judged(replace(first, last=90, frames=90, verdict=Verdict(RIGHT, 1.0, 0.3, ("bad", "joined"))))
+        assert [(event.frame_index, event.kind) for event in log.events] == [(9, "doubtful"), (90, "withdrawn")]
+        assert "joined" in log.events[1].detail
 
 
 class TestPlacement:

@@ -10,6 +10,7 @@ import pytest
 from simulated_features import CAMERA, error_percent, hand_motion, nothing_to_see, observe, room
 
 from improvo.odometry import robust
+from improvo.odometry.alarms import second_map
 from improvo.odometry.alarms.second_map import SecondOpinion
 from improvo.odometry.mapping.initial_pair import InitFailure
 from improvo.odometry.settings import BridgingSettings, OdometrySettings
@@ -129,6 +130,14 @@ def test_a_contradicted_provisional_map_starts_anew_over_all_its_frames(monkeypa
     assert len(run.odometry.segments) == 1
     assert error_percent(trajectory.camera_centers, TRUTH[:80, :3, 3]) < 1.0
     assert sorted(view.frame_index for view in run.final) == list(range(80))
+    # the next map has the same poses, so the first was right, and it is no alarm
+    assert [event.kind for event in run.odometry.events if event.frame_index == 45] == ["checked again"]
+
+
+def test_a_map_that_starts_anew_with_other_poses_is_an_alarm(monkeypatch: pytest.MonkeyPatch) -> None:
+    contradicts_at(monkeypatch, 45)
+    monkeypatch.setattr(second_map, "same_poses", lambda *_: False)
+    run = Run(walk(60))
     assert [event.kind for event in run.odometry.events if event.frame_index == 45] == ["contradiction"]
 
 
@@ -175,6 +184,9 @@ def test_a_map_contradicted_later_ends_its_segment_and_the_next_takes_its_last_f
 
 def test_each_contradicted_map_of_the_same_frames_speaks_against_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
     contradicts_at(monkeypatch, 30, 45)
+    assert not any("former map" in words for words in Run(walk(60)).odometry.segments[0].verdict.evidence)
+    contradicts_at(monkeypatch, 30, 45)
+    monkeypatch.setattr(second_map, "same_poses", lambda *_: False)
     twice = Run(walk(60)).odometry.segments[0].verdict.evidence
     assert "each of 2 former maps of these frames was contradicted by two-view geometry" in twice
     contradicts_at(monkeypatch, 75)

@@ -9,8 +9,10 @@ import pytest
 from simulated_features import CAMERA, hand_motion, observe, room, views_of
 
 from improvo.geometry import se3
+from improvo.odometry.alarms import second_map
 from improvo.odometry.alarms.second_map import SecondOpinion, explained_tracks, same_poses
 from improvo.odometry.events import EventLog
+from improvo.odometry.mapping.initial_pair import TWO_MOTIONS, InitFailure
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
 from improvo.types import Float64
@@ -108,18 +110,40 @@ def test_poses_without_common_frames_or_without_a_path_tell_nothing() -> None:
     assert not same_poses(still, still, MAX_ERROR)
 
 
-@pytest.mark.parametrize(("anew", "kind"), [(TRUTH, "checked again"), (wrong(), "contradiction")])
-def test_a_dropped_map_is_cleared_if_the_next_has_its_poses(anew: Float64, kind: str) -> None:
+@pytest.mark.parametrize("poses_contradicted", [True, False])
+@pytest.mark.parametrize("former", [TRUTH, wrong()])
+def test_a_dropped_map_is_cleared_if_the_next_has_its_poses(former: Float64, *, poses_contradicted: bool) -> None:
+    kind = "checked again" if former is TRUTH else "contradiction"
     opinion, log = second_opinion()
-    opinion.drop(tracked(TRUTH), "a logo")
+    opinion.drop(tracked(former), "a logo", poses_contradicted=poses_contradicted)
     assert log.events == [], "it is told once the next map has started"
-    opinion.on_dropped(tracked(anew))
-    opinion.on_dropped(tracked(anew))
+    cleared = opinion.on_dropped(tracked(TRUTH))
+    assert not opinion.on_dropped(tracked(TRUTH))
+    assert cleared == (kind == "checked again")
     assert [(event.frame_index, event.kind) for event in log.events] == [(FRAMES - 1, kind)]
+
+
+def test_a_map_whose_poses_nothing_contradicted_is_cleared_by_the_tracks() -> None:
+    """The next map is worse. Two views that contradicted the first may have been right all the same."""
+    for poses_contradicted in (False, True):
+        opinion, log = second_opinion()
+        opinion.drop(tracked(TRUTH), "a logo", poses_contradicted=poses_contradicted)
+        assert opinion.on_dropped(tracked(wrong())) == (not poses_contradicted)
+        assert log.events[0].kind == ("contradiction" if poses_contradicted else "checked again")
 
 
 def test_a_dropped_map_that_nothing_follows_was_contradicted() -> None:
     opinion, log = second_opinion()
-    opinion.drop(tracked(TRUTH), "a logo")
-    opinion.on_dropped([])
+    opinion.drop(tracked(TRUTH), "a logo", poses_contradicted=False)
+    assert not opinion.on_dropped([])
     assert [event.kind for event in log.events] == ["contradiction"]
+
+
+@pytest.mark.parametrize(("reason", "stays"), [(TWO_MOTIONS, True), ("too few matches", False)])
+def test_two_views_with_two_motions_give_up_no_map(
+    monkeypatch: pytest.MonkeyPatch, reason: str, *, stays: bool
+) -> None:
+    monkeypatch.setattr(second_map, "start_map", lambda *_: InitFailure(reason))
+    opinion, log = second_opinion()
+    assert opinion.stands(tracked(TRUTH), "two views") == opinion.undecided == stays
+    assert [event.kind for event in log.events] == ["checked again"] * stays

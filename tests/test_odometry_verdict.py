@@ -72,6 +72,18 @@ def test_a_half_of_the_points_that_is_bad_by_chance_does_not_count_and_noise_doe
     assert "pixels off" in judge(noisy, SETTINGS).evidence[0]
 
 
+def test_noise_is_averaged_over_the_keyframes_that_observe_a_point() -> None:
+    usual = 0.0016 * 640
+    noisy = replace(GOOD, noise_px=2.0 * usual)
+    assert estimated_error(replace(noisy, views_per_point=4.0)) == estimated_error(noisy)
+    assert estimated_error(replace(noisy, views_per_point=9.0)) == pytest.approx(
+        (2.0 * 2 / 3) ** 3 * estimated_error(GOOD)
+    )
+    assert estimated_error(replace(noisy, views_per_point=100.0)) == estimated_error(GOOD)
+    shared = replace(GOOD, shared_px=2.0 * 0.0007 * 640, views_per_point=9.0)
+    assert estimated_error(shared) == pytest.approx((2.0 * 2 / 3) ** 3 * estimated_error(GOOD))
+
+
 def test_a_lens_that_is_another_or_changes_is_an_alarm_where_it_is_known_well() -> None:
     same = LensMeasure((0, 40), 0.01, 0.01, 0.02, 0.01)
     assert changed(lens=(same, same)).word == RIGHT
@@ -130,21 +142,37 @@ def test_a_window_tells_that_its_focal_length_changes(growth: float) -> None:
     assert found.growth_error < 0.02
 
 
-def test_joined_stretches_take_the_worse_verdict_and_name_the_scale_between_them() -> None:
+def test_the_error_of_a_joined_stretch_counts_by_its_share_of_the_path() -> None:
     good, bad = judge(GOOD, SETTINGS), changed(error_percent=np.full(6, 3.0))
-    both = joined(good, bad, 0.01)
-    assert (both.word, both.error_percent) == (DOUBTFUL, bad.error_percent)
-    assert both.evidence[-1] == "joined, scale ±1 %"
-    assert joined(good, good, 0.04).error_percent == pytest.approx(2.0)
-    assert joined(good, Verdict(NOT_JUDGED), 0.01).word == RIGHT
-    zoomed = Verdict(DOUBTFUL, 0.5, 0.3, ("the focal length changed",))
-    for both in (joined(good, zoomed, 0.01), joined(zoomed, good, 0.01)):
-        assert both.word == DOUBTFUL
-        assert both.evidence[0] == "the focal length changed"
-        assert both.error_percent == max(good.error_percent, 0.5)
-    unknown = Verdict(DOUBTFUL, float("nan"), float("nan"), ("too few keyframes",))
-    assert joined(unknown, good, 0.01).error_percent == good.error_percent
-    assert joined(bad, zoomed, 0.01).evidence[:2] == (bad.evidence[0], "the focal length changed")
+    assert (good.word, bad.word) == (RIGHT, DOUBTFUL)
+    short = joined(good, bad, 0.01, (9.0, 1.0))
+    assert short.word == RIGHT
+    assert short.error_percent == pytest.approx(np.hypot(0.9 * good.error_percent, 0.1 * bad.error_percent))
+    assert (
+        short.evidence[-1] == f"joined, scale ±1 %: estimated error {short.error_percent:.1f} % of both paths together"
+    )
+    long = joined(bad, good, 0.01, (9.0, 1.0))
+    assert (long.word, long.evidence[0]) == (DOUBTFUL, bad.evidence[0])
+    assert long.error_percent == pytest.approx(np.hypot(0.9 * bad.error_percent, 0.1 * good.error_percent))
+    assert joined(short, good, 0.01, (10.0, 0.0)).error_percent == pytest.approx(short.error_percent)
+
+
+def test_joined_stretches_are_doubtful_by_their_scale_and_by_what_made_one_of_them_so() -> None:
+    good, halves = judge(GOOD, SETTINGS), (1.0, 1.0)
+    assert joined(good, good, 0.04, halves).error_percent == pytest.approx(2.0)
+    assert joined(good, good, 0.11, halves).word == DOUBTFUL
+    assert joined(good, Verdict(NOT_JUDGED), 0.01, halves) == good == joined(Verdict(NOT_JUDGED), good, 0.01, halves)
+    zoomed = judge(GOOD, SETTINGS, ("the focal length changed",))
+    unknown = judge(None, SETTINGS, ("two motions",))
+    for alarmed in (zoomed, unknown):
+        for both in (joined(good, alarmed, 0.01, (99.0, 1.0)), joined(alarmed, good, 0.01, (1.0, 99.0))):
+            assert (both.word, both.evidence[0]) == (DOUBTFUL, alarmed.evidence[0])
+            assert np.isfinite(both.error_percent)
+            assert joined(both, good, 0.01, (1.0, 99.0)).word == DOUBTFUL
+    suspected = judge(GOOD, SETTINGS, (), ("two motions",))
+    larger = changed(error_percent=np.full(6, 1.8))
+    assert (larger.word, suspected.word) == (RIGHT, RIGHT)
+    assert joined(larger, suspected, 0.0, (99.0, 1.0)).word == DOUBTFUL  # over the smaller limit
 
 
 def test_run_json_has_no_nan_and_tells_frames_and_lines() -> None:

@@ -226,7 +226,7 @@ def improve(
         sequences: recordings without ground truth; part of them is held out.
         output: folder for weights, rounds and report; an unfinished one is continued.
         settings: all numbers.
-        rounds: of training and validation; by default up to three, as long as each is better than the one before.
+        rounds: of training and validation; by default two, or one where that is not better or two take too long.
         evaluate: recordings to hold out; without any, some of `sequences`, or the last part of a single one.
         workers: sequences labelled at a time, a process with one core for each; by default one, in this process.
         after: finished folder of an earlier call, whose recordings are replayed and must not get worse.

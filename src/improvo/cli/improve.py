@@ -1,8 +1,8 @@
 """Self-improvement: train a network on video by its own odometry, keep it if it got better on video it never saw.
 
 Leaves OUT/weights.safetensors, the best of all rounds and of the start, and OUT/report.html. Part of the video is held
-out and never trained on; run again to continue a run that was stopped, or with a higher --rounds. By itself it makes up
-to three rounds, as many as fit in about half an hour, and ends with the first that is not better.
+out and never trained on; run again to continue a run that was stopped, or with a higher --rounds. By itself it makes
+two rounds, or one where the first is not better, or where two would take much more than half an hour.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rounds",
         type=int,
         metavar="N",
-        help="of training and validation; one that is not better is tried again (default: up to 3 in about half an "
-        "hour, until one is not better)",
+        help="of training and validation; where one is not better the next tries again (default: 2, or 1 where that is "
+        "not better or two take much more than half an hour)",
     )
     parser.add_argument(
         "--evaluate",
@@ -175,6 +175,6 @@ def _plan(arguments: argparse.Namespace, settings: ImproveSettings) -> int:
         plan = plan_improvement(
             arguments.sequences, settings, arguments.rounds, arguments.evaluate, shown.advance, arguments.after
         )
-    say_improve_plan(plan)
+    say_improve_plan(plan, arguments.rounds is not None)
     next_step("the same without --plan and with -o OUT does it")
     return 0

@@ -52,16 +52,22 @@ def say_label_plan(plan: LabelPlan) -> None:
     figures(values, "")
 
 
-def say_improve_plan(plan: ImprovePlan) -> None:
-    """For people."""
+def say_improve_plan(plan: ImprovePlan, asked: bool) -> None:
+    """For people.
+
+    Args:
+        plan: of the loop.
+        asked: whether the number of rounds was given; by itself the loop may end before.
+    """
     once, needed = plan.once, plan.needed
     values = label_figures(once, plan.labelings)
     say(
         f"sample: {once.sample_frames} frames on this machine: {values['frames_per_second_per_core']:.3g} frames a "
         f"second per core"
     )
+    rounds = counted(plan.rounds, "round") if asked else f"up to {counted(plan.rounds, 'round')}"
     say(
-        f"labelling: {once.frames} frames, {plan.labelings:.2g} times in {counted(plan.rounds, 'round')}: "
+        f"labelling: {once.frames} frames, {plan.labelings:.2g} times in {rounds}: "
         f"{duration(plan.labelings * once.core_seconds)} of one core"
     )
     times = ", ".join(f"{n}: {duration(plan.labelings * once.seconds(n))}" for n in useful_workers(once))

@@ -68,7 +68,7 @@ def improve(
         output: folder of the result; an unfinished one is continued.
         settings: all of them; `settings.frontend.name` is where the loop starts.
         rounds: of training and validation, each from the best weights before it. By default they end with the first
-            that is not better, and after `improvo.improvement.plan.usual_rounds`.
+            that is not better, and after those of `improvo.improvement.plan.usual_rounds`.
         evaluate: recordings to hold back; without any, some of `sequences`, or the last part of a single one.
         workers: sequences labelled at a time, a process with one core for each; by default one, in this process.
         ray: address of a Ray cluster that labels them, see `improvo.jobs.on_ray`.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from improvo.odometry.mapping.bridging import Join
 from improvo.odometry.segments import Segment
-from improvo.odometry.verdict.verdict import DOUBTFUL, NOT_JUDGED, Verdict
+from improvo.odometry.verdict.verdict import DOUBTFUL, NOT_JUDGED, RIGHT, Verdict
 
 _WORTH_SAYING = 0.03  # share of the keypoints
 _SAID_AGAIN = 20  # frames
@@ -18,7 +18,7 @@ class Event:
 
     frame_index: int
     # "initialising", "segment", "lost", "contradiction", "checked again", "bridged", "uncertain", "doubtful",
-    # "attached", "two motions" or "focal length"
+    # "withdrawn", "attached", "two motions" or "focal length"
     kind: str
     detail: str
 
@@ -93,6 +93,10 @@ class EventLog:
         for first, last in segment.verdict.uncertain:
             if (first, last) not in before.uncertain:
                 self._add(first, "uncertain", f"the scale is not determined between frames {first} and {last}")
+        if segment.verdict.word == RIGHT and before.word == DOUBTFUL:
+            self._add(
+                segment.last, "withdrawn", f"segment {segment.number} is believed: {segment.verdict.evidence[-1]}"
+            )
         if segment.verdict.word == DOUBTFUL != before.word:
             self._add(segment.last, "doubtful", f"segment {segment.number}: {segment.verdict.evidence[0]}")
 

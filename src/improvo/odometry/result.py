@@ -38,6 +38,7 @@ class OdometryResult:
         self._placement = SegmentPlacement()
         self._window_errors: list[float] = []  # pixels, of the running segment
         self._frame_indices: list[int] = []  # of its final views
+        self._path, self._last_center = 0.0, np.full(3, np.nan)  # of the running segment, in the shared unit
         self._joined: int | None = None  # the ended segment that the running one goes on
         self._scale_error = 0.0  # relative, between the two
         self.segments: list[Segment] = []
@@ -110,6 +111,8 @@ class OdometryResult:
         errors = np.linalg.norm(self._camera.project(points_cam) - view.keypoints[rows], axis=1)
         self._map.add(points, errors)
         world_from_cam = self._placement.place(cam_from_world, points_cam[:, 2])
+        step = float(np.linalg.norm(world_from_cam[:3, 3] - self._last_center)) if self._frame_indices else 0.0
+        self._path, self._last_center = self._path + step, world_from_cam[:3, 3]
         self._frame_indices.append(view.frame_index)
         self._emit(view, world_from_cam, self.running_segment)
 
@@ -137,6 +140,7 @@ class OdometryResult:
             mean_error=float(np.nanmean(errors)) if np.isfinite(errors).any() else float("nan"),
             reason=reason,
             verdict=verdict or Verdict(NOT_JUDGED),
+            path=self._path,
         )
         if self._joined is None:
             self.segments.append(segment)
@@ -144,6 +148,7 @@ class OdometryResult:
             segment = extended(self.segments[self._joined], segment, self._scale_error)
             self.segments[self._joined] = segment
         self._window_errors, self._frame_indices, self._joined = [], [], None
+        self._path = 0.0
         return segment
 
     def with_running(

@@ -28,6 +28,7 @@ _CARRIED = 0.2  # share of the observations that turned out to move with the cam
 _MAX_BUFFERED = 300  # frames in the initialisation buffer; the oldest leaves it without a pose
 _LOST = "lost"  # why a segment ended
 _TWO_VIEWS, _ATTACHED = "two-view geometry", "what moves with the camera"  # what contradicted it
+_ANOTHER_MOTION = "two motions are in the picture, and one of them is not the camera's"
 
 
 class RobustMapper(Mapper):
@@ -101,7 +102,7 @@ class RobustMapper(Mapper):
             return
         if self._health.ambiguous:
             self._events.two_motions(view.frame_index)
-            self._judge.suspicion("two motions are in the picture, and one of them is not the camera's")
+            self._judge.suspicion(_ANOTHER_MOTION)
         self._bridge(self._map, [view])
         self._confirm()
         self._slide()
@@ -146,12 +147,13 @@ class RobustMapper(Mapper):
         if self._lens.factor != 1.0:
             self._events.focal_length(self._buffer[0].frame_index, self._lens.factor, "the segment is doubtful")
             self._judge.alarm(f"the focal length is about {self._lens.factor:.2f} times that of the camera as given")
+        if self._second_opinion.on_dropped(self._buffer) and self._contradicted:
+            self._contradicted -= 1
         if self._contradicted:
             maps = "a former map" if self._contradicted == 1 else f"each of {self._contradicted} former maps"
             words = f"{maps} of these frames was contradicted by {_TWO_VIEWS}"
             # one was worse than the map that followed; several in a row tell that these frames mislead
             self._judge.suspicion(words, self._contradicted if self._contradicted > 1 else 0)
-        self._second_opinion.on_dropped(self._buffer)
         self._result.begin_segment()
         self._result.give_up(each for each in self._buffer if each.cam_from_world is None)
         self._health = HealthCheck(self._camera, self._settings, self._descriptor_distance)
@@ -194,11 +196,11 @@ class RobustMapper(Mapper):
             join = self._bridging.look(view, local_map.store.xyz, self._provisional) if view.keyframe else None
             if join is None:
                 continue
+            if self._result.running_segment != join.number:
+                self._events.bridged(view.frame_index, join)
             self._result.join(join.number, join.shared_from_new, join.scale_error)
-            self._events.bridged(view.frame_index, join)
             for each in self._provisional:
                 each.segment = join.number
-            return
 
     def _slide(self) -> None:
         self._window.slide()
@@ -216,7 +218,12 @@ class RobustMapper(Mapper):
         views = self._provisional if self._states.is_provisional else history[-2 * self._settings.window.recent :]
         if not self._second_opinion.stands(views, _TWO_VIEWS):
             return False
-        self._judge.suspicion(f"{_TWO_VIEWS} spoke against the map, and a second map did not")
+        if self._second_opinion.undecided:
+            self._judge.suspicion(_ANOTHER_MOTION)
+        else:
+            self._judge.suspicion(
+                f"{_TWO_VIEWS} spoke against the map, and a second map did not", 0
+            )  # which settles it
         self._health.start_over()
         return True
 
@@ -224,10 +231,7 @@ class RobustMapper(Mapper):
         """The map is wrong: a provisional one starts anew over all its frames, another one over its last frames."""
         contradicted = self._contradicted + (by == _TWO_VIEWS)
         if self._states.is_provisional:
-            if by == _TWO_VIEWS:
-                self._events.contradicted(view.frame_index, "the map is started anew", by)
-            else:
-                self._second_opinion.drop(self._provisional, by)
+            self._second_opinion.drop(self._provisional, by, poses_contradicted=by == _TWO_VIEWS)
             self._buffer = self._provisional
             self._clear()
             self._states.map_ended()

@@ -23,6 +23,7 @@ class Segment:
     mean_error: float  # pixels, mean over its window adjustments; NaN where no window was adjusted
     reason: str  # why it ended
     verdict: Verdict = field(default_factory=lambda: Verdict(NOT_JUDGED))  # whether its path is believed
+    path: float = 0.0  # its length, in the unit that all segments are placed in
 
 
 def extended(segment: Segment, by: Segment, scale_error: float) -> Segment:
@@ -38,7 +39,8 @@ def extended(segment: Segment, by: Segment, scale_error: float) -> Segment:
         frames=frames,
         mean_error=float(np.average(errors[known], weights=weights)) if known.any() else float("nan"),
         reason=by.reason,
-        verdict=joined(segment.verdict, by.verdict, scale_error),
+        verdict=joined(segment.verdict, by.verdict, scale_error, (segment.path, by.path)),
+        path=segment.path + by.path,
     )
 
 

@@ -9,6 +9,7 @@ explain clearly more tracks; it is not if they explain no more, or if they are t
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from improvo.geometry.camera import Camera
 from improvo.geometry.triangulation import triangulate_tracks
 from improvo.odometry.events import EventLog
 from improvo.odometry.gates import SAME_TURN_DEG
-from improvo.odometry.mapping.initial_pair import InitFailure
+from improvo.odometry.mapping.initial_pair import TWO_MOTIONS, InitFailure
 from improvo.odometry.mapping.start import start_map
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
@@ -30,6 +31,16 @@ Poses = Mapping[int, Float64]  # cam_from_world (4, 4) by frame index
 _LEAST_VIEWS = 3  # of a track: two views fit a point of their own under nearly any poses
 _BETTER = 1.1  # times as many tracks: less is chance (docs/odometry.md)
 _SAME = 0.5  # of the error that a segment may have, and of one turn: two maps so near to each other are the same
+
+
+@dataclass(frozen=True)
+class _Dropped:
+    """A map that was given up."""
+
+    frame_index: int  # at which
+    by: str  # why
+    poses: Poses
+    poses_contradicted: bool
 
 
 class SecondOpinion:
@@ -49,44 +60,79 @@ class SecondOpinion:
         self._settings = settings
         self._descriptor_distance = descriptor_distance
         self._events = events
-        self._dropped: tuple[int, str, Poses] | None = None  # frame at which, why, and the poses that it had
+        self._dropped: _Dropped | None = None
+        self.undecided = False  # whether the last map that stays does so because the second had two motions
 
     def stands(self, views: Sequence[View], by: str) -> bool:
         """Whether a map that was contradicted stays, since one started anew explains the tracks no better.
+
+        It stays undecided, too, where the second could choose between two motions: so could the two views.
 
         Args:
             views: in temporal order, with the poses of the map; they stay as they are.
             by: what contradicted it.
         """
+        self.undecided = False
         copies = [view.unposed() for view in views]
-        if isinstance(start_map(copies, self._camera, self._settings, self._descriptor_distance), InitFailure):
-            return False
+        started = start_map(copies, self._camera, self._settings, self._descriptor_distance)
+        if isinstance(started, InitFailure):
+            if started.reason != TWO_MOTIONS:
+                return False
+            self.undecided = True
+            found = "has two motions to choose from, so it stays"  # as the two views had that spoke against it
+            self._events.checked_again(views[-1].frame_index, by, found)
+            return True
         former, anew = _poses_of(views), _poses_of(copies)
-        common, tolerance = [view for view in views if view.frame_index in anew], self._settings.tolerance
-        tracks, tracks_anew = (explained_tracks(common, poses, self._camera, tolerance) for poses in (former, anew))
-        if tracks_anew > _BETTER * tracks:
+        if self._better([view for view in views if view.frame_index in anew], former, anew):
             return False
         self._events.checked_again(views[-1].frame_index, by, "explains no more of the tracks, so it stays")
         return True
 
-    def drop(self, views: Sequence[View], by: str) -> None:
-        """A provisional map is started anew over its views; it may have been right all the same."""
-        self._dropped = views[-1].frame_index, by, _poses_of(views)
+    def drop(self, views: Sequence[View], by: str, *, poses_contradicted: bool) -> None:
+        """A provisional map is started anew over its views; it may have been right all the same.
 
-    def on_dropped(self, views: Sequence[View]) -> None:
+        Args:
+            views: in temporal order, with the poses of the map.
+            by: what spoke against it.
+            poses_contradicted: whether that said something of its poses; what moves with the camera only tells that
+                many of its points are none of the world.
+        """
+        self._dropped = _Dropped(views[-1].frame_index, by, _poses_of(views), poses_contradicted)
+
+    def on_dropped(self, views: Sequence[View]) -> bool:
         """The next map has started, or there is none; now it is told whether the one that was dropped was wrong.
 
         Args:
             views: of the next map.
+
+        Returns:
+            Whether it was not: the next one has its poses, or, if nothing contradicted those, explains no more of the
+            tracks of the same frames.
         """
         if self._dropped is None:
-            return
-        frame_index, by, poses = self._dropped
+            return False
+        dropped, anew = self._dropped, _poses_of(views)
         self._dropped = None
-        if same_poses(poses, _poses_of(views), self._settings.verdict.max_error):
-            self._events.checked_again(frame_index, by, "has the same poses")
-        else:
-            self._events.contradicted(frame_index, "the map is started anew", by)
+        if same_poses(dropped.poses, anew, self._settings.verdict.max_error):
+            self._events.checked_again(dropped.frame_index, dropped.by, "has the same poses")
+            return True
+        common = [view for view in views if view.frame_index in dropped.poses and view.frame_index in anew]
+        if (
+            not dropped.poses_contradicted
+            and len(common) >= _LEAST_VIEWS
+            and not self._better(common, dropped.poses, anew)
+        ):
+            self._events.checked_again(dropped.frame_index, dropped.by, "explains no more of the tracks")
+            return True
+        self._events.contradicted(dropped.frame_index, "the map is started anew", dropped.by)
+        return False
+
+    def _better(self, views: Sequence[View], former: Poses, anew: Poses) -> bool:
+        """Whether the second poses explain clearly more tracks of the views than the first."""
+        tracks, tracks_anew = (
+            explained_tracks(views, poses, self._camera, self._settings.tolerance) for poses in (former, anew)
+        )
+        return tracks_anew > _BETTER * tracks
 
 
 def _poses_of(views: Sequence[View]) -> dict[int, Float64]:

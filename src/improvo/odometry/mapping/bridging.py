@@ -1,14 +1,14 @@
 """Joining a new map with that of a segment that ended before, where the camera sees the same place again.
 
 Two views of the new map must find the former one, and agree on where it lies and how large it is, and the camera must
-have been able to come from there to here. Otherwise two segments with scales of their own stand side by side, placed by
-guess.
+have been able to come from there to here. The newest two that do so count, as long as nothing is final. Otherwise two
+segments with scales of their own stand side by side, placed by guess.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,7 +47,9 @@ class Bridging:
         self._min_points = settings.start.min_points
         self._former: list[FormerMap] = []
         self._sightings: dict[int, list[Sighting]] = {}  # by row of the former map
-        self._found = False  # in which the running map lies
+        self._join: Join | None = None  # of the running map,
+        self._joined_map: FormerMap | None = None  # with this one,
+        self._last: Sighting | None = None  # which this one was the last to see
 
     def remember(self, former: FormerMap) -> None:
         """A segment has ended; where it went on with a former one, both maps are kept."""
@@ -56,18 +58,18 @@ class Bridging:
 
     def new_map(self) -> None:
         """What was seen from another map does not count any more."""
-        self._sightings, self._found = {}, False
+        self._sightings, self._join, self._joined_map, self._last = {}, None, None, None
 
     def look(self, view: View, xyz: Float64, running: Sequence[View]) -> Join | None:
-        """The join that this view decides, if it and another one agree.
+        """The join that this view decides, if it and another one agree; or what it changes of the one that there is.
 
         Args:
             view: of the running map, with a pose.
             xyz: (P, 3) points of the running map.
             running: its views from the first one on.
         """
-        if self._found:
-            return None
+        if self._join is not None:
+            return self._look_again(view, xyz, running)
         oldest = view.frame_index - self._max_frames
         for row, former in enumerate(self._former):
             if former.last_frame < oldest:
@@ -76,21 +78,47 @@ class Bridging:
             if sighting is None:
                 continue
             for other in self._sightings.get(row, []):
-                join = _joined(former, other, sighting, self._max_error)
-                if join is None or join.points < self._min_points:  # a place that looks alike has a few points, too
-                    continue
-                if join.scale_error > self._max_error:
-                    continue
-                here = Course.of(running).placed(join.shared_from_new)
-                # where texture repeats, a place one repetition off looks the same, in every view
-                if here.is_leap_from(
-                    former.course, slack=self._max_error * sighting.depth * former.shared_from_own.scale
-                ):
-                    continue
-                self._found = True
-                return join
+                join = self._believed(former, other, sighting, running)
+                if join is not None:
+                    self._join, self._joined_map, self._last = join, former, sighting
+                    return join
             self._sightings.setdefault(row, []).append(sighting)
         return None
+
+    def _look_again(self, view: View, xyz: Float64, running: Sequence[View]) -> Join | None:
+        """The join by the newest two sightings; None where this view does not see the former map.
+
+        The depths of a map that has just started are poorly known, all together, so that its scale can change by a
+        factor of two while the camera moves on. Where the two do not agree, the scale is known no better than the
+        newest one differs from that of the join.
+        """
+        assert self._join is not None
+        assert self._joined_map is not None
+        assert self._last is not None
+        former, before = self._joined_map, self._last
+        sighting = former.sighting(view, xyz)
+        if sighting is None:
+            return None
+        self._last = sighting
+        join = self._believed(former, before, sighting, running)
+        if join is None:
+            now = former.shared_from_own.scale * sighting.former_from_new.scale
+            change = abs(float(np.log(now / self._join.shared_from_new.scale))) - 3.0 * sighting.scale_error
+            join = replace(self._join, scale_error=max(self._join.scale_error, change))
+        self._join = join
+        return join
+
+    def _believed(self, former: FormerMap, a: Sighting, b: Sighting, running: Sequence[View]) -> Join | None:
+        """The join by two sightings; None where they contradict each other or the camera's course."""
+        join = _joined(former, a, b, self._max_error)
+        if join is None or join.points < self._min_points:  # a place that looks alike has a few points, too
+            return None
+        if join.scale_error > self._max_error:
+            return None
+        here = Course.of(running).placed(join.shared_from_new)
+        # where texture repeats, a place one repetition off looks the same, in every view
+        slack = self._max_error * b.depth * former.shared_from_own.scale
+        return None if here.is_leap_from(former.course, slack=slack) else join
 
 
 def _joined(former: FormerMap, a: Sighting, b: Sighting, max_error: float) -> Join | None:

@@ -23,6 +23,7 @@ _MIN_INLIER_SHARE = 0.3  # essential inliers of the matches
 # points of a second motion over a plane, over those of the first: with more the choice between them is open.
 _MOSTLY = 0.75
 _MAX_SECOND_MOTION = 0.5  # spread over the picture of another motion, as a share of the first one's
+TWO_MOTIONS = "two motions: one of them is not the camera's"  # why no map starts; which one it is, two views do not say
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def initial_pair(
         return InitFailure("too little parallax: a rotation explains the tracks")
     another = replace(ransac, max_iterations=1000)
     if has_second_motion(essential.pose, camera, pixels_a, pixels_b, another, _MAX_SECOND_MOTION):
-        return InitFailure("two motions: one of them is not the camera's")
+        return InitFailure(TWO_MOTIONS)
     ratio = plane.inliers.sum() / max(inliers.sum(), 1)
     off_plane = (inliers & ~plane.inliers).sum()
     if ratio > _MOSTLY and off_plane < 2 * least:

@@ -51,6 +51,7 @@ class Spread:
         width: of the picture in pixels.
         lens: what the windows say of the focal length.
         shared_px: of the residuals, what neighbours in the picture have in common (`shared_errors.py`).
+        views_per_point: keyframes that observe a point, mean.
     """
 
     error_percent: Float64
@@ -60,6 +61,7 @@ class Spread:
     width: int
     lens: tuple[LensMeasure, ...] = ()
     shared_px: float = 0.0
+    views_per_point: float = 1.0
 
 
 @dataclass
@@ -100,6 +102,8 @@ class EvidenceCheck:
         self._across: dict[int, int] = {}  # points on both sides of the gap after a keyframe, by any window
         self._errors: list[float] = []  # pixels, median of each window
         self._shared: list[float] = []  # pixels, of each window
+        self._observations = 0
+        self._is_seen = np.zeros(0, np.bool_)  # by map point
         self._scale_steps: list[Float64] = []
         self._links: list[tuple[int, int]] = []
         self._lens: list[LensMeasure] = []
@@ -120,6 +124,10 @@ class EvidenceCheck:
         self._pending.append(keyframe)
         self._centers.append(se3.inverse(cam_from_world)[:3, 3])
         self._frames.append(view.frame_index)
+        if len(xyz) > len(self._is_seen):
+            self._is_seen = np.concatenate([self._is_seen, np.zeros(len(xyz), np.bool_)])
+        self._is_seen[keyframe.points] = True
+        self._observations += len(keyframe.points)
         if len(self._pending) == _WINDOW:
             self._solve_window(xyz)
 
@@ -147,6 +155,7 @@ class EvidenceCheck:
             width=self._camera.width,
             lens=tuple(self._lens),
             shared_px=float(np.median(self._shared)) if self._shared else 0.0,
+            views_per_point=self._observations / max(int(self._is_seen.sum()), 1),
         )
 
     def _mark_empty_gaps(self, centers: Float64) -> None:
@@ -188,9 +197,17 @@ class EvidenceCheck:
             path.world_from_cam = path.world_from_cam[-self._overlap :]
 
     def _masks(self, window: EvidenceWindow) -> list[Mask]:
-        """Which observations (O,) belong to each of PARTS."""
-        left = window.keypoints[:, 0] < 0.5 * self._camera.width
-        upper = window.keypoints[:, 1] < 0.5 * self._camera.height
+        """Which observations (O,) belong to each of PARTS.
+
+        A jackknife needs groups of the same size. Where half of a picture is bare, a quarter of its area can have most
+        of the evidence, and what is left without it tells little of the path. So each quarter has a quarter of the
+        observations: the picture is cut at their median, and each half of it at its own.
+        """
+        x, y = window.keypoints.T
+        left = x < np.median(x)
+        upper = np.zeros(len(y), np.bool_)
+        for side in (left, ~left):
+            upper[side] = y[side] < (np.median(y[side]) if side.any() else 0.0)
         half = ((window.ids[window.point] * _HASH) >> 7) & 1 == 0
         return [~(upper & left), ~(upper & ~left), ~(~upper & left), ~(~upper & ~left), half, ~half]
 

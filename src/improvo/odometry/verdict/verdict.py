@@ -16,6 +16,7 @@ from improvo.types import Float64
 _SCALE_SHARE = 40.0  # % of the path that a change of scale by the factor e moves (calibrated: docs/odometry.md)
 _USUAL_NOISE = 0.0016  # share of the picture's width; the estimate grows with noise that is larger
 _USUAL_SHARED = 0.0007  # the same of what neighbours are off by together: up to 0.0006 by a camera known roughly
+_USUAL_VIEWS = 4.0  # keyframes that observe a point; more of them average the noise
 _NOISE_POWER = 3  # noise of 1.4 times the usual one came with 3 to 5 times the spread (docs/robustness-odometry.md)
 _FOCAL_CHANGE = 0.12  # of the logarithm of the focal length, within a window or from one to the next
 _FOCAL_ERROR = 0.2  # of the logarithm of the focal length, from that of the camera as given
@@ -37,6 +38,7 @@ class Verdict:
         noise_px: of the observations, standard deviation of one coordinate; NaN: not measured.
         evidence: why, in plain words.
         uncertain: first and last frame of each stretch whose scale is not determined.
+        limit: of the estimated error, over which the path is doubtful; NaN: it does not decide.
     """
 
     word: str
@@ -44,6 +46,7 @@ class Verdict:
     noise_px: float = float("nan")
     evidence: tuple[str, ...] = ()
     uncertain: tuple[tuple[int, int], ...] = ()
+    limit: float = float("nan")
 
     def report(self) -> dict[str, Any]:
         """For run.json, which knows no NaN."""
@@ -84,26 +87,45 @@ def judge(
     evidence += [f"frames {first} to {last}: the scale is not determined" for first, last in uncertain]
     limit = settings.max_error * _SUSPECTED ** (suspected if suspicions else 0)
     word = RIGHT if error <= limit and not alarms else DOUBTFUL
-    return Verdict(word, error, spread.noise_px, tuple(evidence), uncertain)
+    return Verdict(word, error, spread.noise_px, tuple(evidence), uncertain, float("nan") if alarms else limit)
 
 
-def joined(first: Verdict, second: Verdict, scale_error: float) -> Verdict:
+def joined(first: Verdict, second: Verdict, scale_error: float, paths: tuple[float, float]) -> Verdict:
     """The verdict of two stretches of one world, with a scale between them that is known to `scale_error` (relative).
 
-    The worse of the two counts: a doubtful one before a right one, then the one with the larger error. The scale
-    between them moves half of the path by that share of its size at most.
+    The error of each is a share of its own path, and counts by the share that this has of both paths. The scale between
+    them moves half of the path by that share of its size at most. What makes one of them doubtful whatever its error
+    makes both so, and the smaller limit counts.
+
+    Args:
+        first: of the earlier stretch.
+        second: of the later one.
+        scale_error: standard error of the scale between them, relative.
+        paths: lengths of both, in one unit.
     """
     if NOT_JUDGED in (first.word, second.word):
-        known = second if first.word == NOT_JUDGED else first
-        return Verdict(known.word, known.error_percent, known.noise_px, known.evidence, known.uncertain)
-    better, worse = sorted((first, second), key=lambda each: (each.word == DOUBTFUL, np.nan_to_num(each.error_percent)))
-    alarms = better.evidence[:1] if better.word == DOUBTFUL else ()
+        return second if first.word == NOT_JUDGED else first
+    shares = np.array(paths) / max(sum(paths), 1e-300)
+    own = np.array([first.error_percent, second.error_percent])
+    error = float(np.nanmax([np.linalg.norm(np.nan_to_num(shares * own)), 50.0 * scale_error]))
+    limits = [each.limit for each in (first, second) if np.isfinite(each.limit)]
+    alarmed = [each for each in (first, second) if each.word == DOUBTFUL and not np.isfinite(each.limit)]
+    doubtful = bool(alarmed) or error > min(limits, default=float("inf"))
+    contributions = np.nan_to_num(shares * own)
+    worse, better = (first, second) if contributions[0] >= contributions[1] else (second, first)
+    if better in alarmed and worse not in alarmed:
+        worse, better = better, worse
     return Verdict(
-        worse.word,
-        float(np.nanmax([first.error_percent, second.error_percent, 50.0 * scale_error])),
+        DOUBTFUL if doubtful else RIGHT,
+        error,
         float(np.fmax(first.noise_px, second.noise_px)),
-        (*worse.evidence, *alarms, f"joined, scale ±{100 * scale_error:.1g} %"),
+        (
+            *worse.evidence,
+            *(better.evidence[:1] if better.word == DOUBTFUL else ()),
+            f"joined, scale ±{100 * scale_error:.1g} %: estimated error {error:.1f} % of both paths together",
+        ),
         (*first.uncertain, *second.uncertain),
+        float("nan") if alarmed else min(limits, default=float("nan")),
     )
 
 
@@ -113,10 +135,12 @@ def estimated_error(spread: Spread) -> float:
     The root sum of squares of what the paths of the parts differ by, and of what the least certain change of scale
     moves. Of the two halves of the points the better one counts twice: the other can have too few by chance. Unusual
     noise is worse than its spread: what does not fit is dropped, so what stays agrees with what is wrong. So is what
-    neighbours are off by together, which is no noise of keypoints at all: the map follows several motions.
+    neighbours are off by together, which is no noise of keypoints at all: the map follows several motions. Where a
+    point is seen by more keyframes than usual, both are averaged over its views, as by the square root of their number.
     """
-    noise = np.nan_to_num(spread.noise_px) / (_USUAL_NOISE * spread.width)
-    shared = spread.shared_px / (_USUAL_SHARED * spread.width)
+    averaged = min(float(np.sqrt(_USUAL_VIEWS / max(spread.views_per_point, 1.0))), 1.0)
+    noise = averaged * np.nan_to_num(spread.noise_px) / (_USUAL_NOISE * spread.width)
+    shared = averaged * spread.shared_px / (_USUAL_SHARED * spread.width)
     quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
     scale = _SCALE_SHARE * float(_scale_errors(spread).max(initial=0.0))
     spreads = (quarters**2).sum() + len(HALVES) * halves.min() ** 2 + scale**2
