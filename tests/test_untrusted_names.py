@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from improvo import config
@@ -196,3 +197,16 @@ def test_a_pipe_or_a_device_is_never_read(special: str, tmp_path: Path) -> None:
     ):
         with pytest.raises(ImprovoError, match=words):
             read()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs a POSIX system")
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_pipe_among_the_pictures_is_left_out_and_named(suffix: str, tmp_path: Path) -> None:
+    for number in range(6):
+        cv2.imwrite(str(tmp_path / f"{number:06d}{suffix}"), np.full((48, 64), 40 * number, np.uint8))
+    pipe = tmp_path / f"000003{suffix}"
+    pipe.unlink()
+    os.mkfifo(pipe)
+    sequence = open_sequence(tmp_path, fov=60.0)
+    assert len(list(sequence)) == 5
+    assert [(each.index, each.reason) for each in sequence.skipped] == [(3, "is a pipe or a device, not a file")]
