@@ -7,19 +7,27 @@ from contextlib import suppress
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from improvo import config
 from improvo.cli.main import main
+from improvo.continuation import SettingsRecord
 from improvo.errors import ConfigError, ImprovoError, InputError, OutputError
+from improvo.evaluation.truth.reference import lacks_times
 from improvo.files import check_output_folder, write_text
 from improvo.geometry.camera_files import calibration_yaml, load_calibration
+from improvo.geometry.text_files import read_text
 from improvo.geometry.trajectory_files import read_times, read_trajectory
+from improvo.odometry.run_folder import RunFolder
 from improvo.odometry.run_settings import RunSettings
-from improvo.sequences import open_sequence
-from improvo.sequences.images import natural_key
+from improvo.sequences import SequenceSettings, open_sequence
+from improvo.sequences.base import UnreadableFrameError
+from improvo.sequences.images import natural_key, read_image
+from improvo.sequences.mask import size_of
 from improvo.sequences.opening import FORMATS
-from improvo.untrusted.text import load_json, load_yaml
+from improvo.stability.tables import read_points
+from improvo.untrusted.text import load_json, load_yaml, read_json_file
 from sequence_builders import CAMERA, images, write_images
 
 DIGITS = "9" * 5000
@@ -165,3 +173,40 @@ def test_a_text_that_calls_itself_a_video(tmp_path: Path, script: str, suffix: s
     (tmp_path / f"v{suffix}").write_text(script.replace("{0}", "secret.avi"))
     assert "not a video" in refused(lambda path: open_sequence(path, fov=60.0), tmp_path / f"v{suffix}")
     assert len(open_sequence(tmp_path / "secret.avi", fov=60.0)) == 3
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs a POSIX system")
+@pytest.mark.parametrize("special", ["pipe", "/dev/zero"])
+def test_a_pipe_or_a_device_is_never_read(special: str, tmp_path: Path) -> None:
+    """It may lie in a folder of a stranger; to open one without a writer waits forever."""
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("a.png", "a.txt", "a.json", "a.yaml", "a.parquet", "run.json"):
+        (tmp_path / name).symlink_to(tmp_path / "pipe" if special == "pipe" else special)
+    words = "is a pipe or a device, not a file"
+    with pytest.raises(UnreadableFrameError, match=words):
+        read_image(tmp_path / "a.png")
+    assert size_of(tmp_path / "a.png") is None
+    for read in (
+        lambda: read_text(tmp_path / "a.txt"),
+        lambda: read_json_file(tmp_path / "a.json", "mend it"),
+        lambda: SettingsRecord(tmp_path / "a.yaml").read(),
+        lambda: config.load(SequenceSettings, tmp_path / "a.yaml"),
+        lambda: read_points(tmp_path / "a.parquet"),
+        lambda: RunFolder(tmp_path),
+        lambda: lacks_times(tmp_path / "a.txt"),
+    ):
+        with pytest.raises(ImprovoError, match=words):
+            read()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs a POSIX system")
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_pipe_among_the_pictures_is_left_out_and_named(suffix: str, tmp_path: Path) -> None:
+    for number in range(6):
+        cv2.imwrite(str(tmp_path / f"{number:06d}{suffix}"), np.full((48, 64), 40 * number, np.uint8))
+    pipe = tmp_path / f"000003{suffix}"
+    pipe.unlink()
+    os.mkfifo(pipe)
+    sequence = open_sequence(tmp_path, fov=60.0)
+    assert len(list(sequence)) == 5
+    assert [(each.index, each.reason) for each in sequence.skipped] == [(3, "is a pipe or a device, not a file")]

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from improvo.errors import ConfigError, InputError
-from improvo.untrusted.paths import check_path
+from improvo.untrusted.paths import check_is_file, check_path
 from improvo.untrusted.text import load_yaml, reason
 
 T = TypeVar("T")
@@ -98,7 +98,7 @@ def load(cls: type[T], path: Path | None = None, overrides: Iterable[str] = (), 
     merged: dict[str, Any] = {}
     if path is not None:
         try:
-            check_path(path)
+            check_is_file(check_path(path))
             loaded = load_yaml(path.read_text(encoding="utf-8")) or {}
         except InputError as error:
             raise ConfigError(str(error)) from None

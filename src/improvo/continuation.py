@@ -10,7 +10,7 @@ from typing import Any
 from improvo import config
 from improvo.errors import ConfigError, InputError
 from improvo.files import write_json, write_text
-from improvo.untrusted.paths import check_readable
+from improvo.untrusted.paths import check_is_file, check_readable
 from improvo.untrusted.text import load_json, load_yaml
 
 _LONGEST_VALUE = 60  # characters of a value in a message
@@ -48,9 +48,9 @@ class SettingsRecord:
         Raises:
             InputError: the file is damaged, or may not be read.
         """
-        if not self.path.is_file():
+        if not self.path.exists():
             return None
-        check_readable(self.path)
+        check_is_file(check_readable(self.path))
         try:
             text = self.path.read_text(encoding="utf-8")
             values = load_json(text) if self.path.suffix == ".json" else load_yaml(text)

@@ -21,7 +21,7 @@ from improvo import locations
 from improvo.errors import InputError, OutputError
 from improvo.formats import FORMAT, FORMAT_KEY, check_format
 from improvo.locations.place import MARKER as MARKER  # of a folder that a command of ours has made
-from improvo.untrusted.paths import check_path, is_text
+from improvo.untrusted.paths import check_is_file, check_path, is_text
 from improvo.untrusted.text import load_json
 
 if TYPE_CHECKING:
@@ -283,8 +283,8 @@ def _marker(path: Path) -> dict[str, Any]:
     """What the marker of a folder says; empty where there is none."""
     for name in (MARKER, f".{FORMER_NAME}.json"):
         try:
-            marker = load_json((path / name).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            marker = load_json(check_is_file(path / name).read_text(encoding="utf-8"))
+        except (InputError, OSError, ValueError):
             continue
         if isinstance(marker, dict):
             return marker

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from improvo.errors import InputError
 from improvo.untrusted.limits import MAX_TEXT_BYTES
-from improvo.untrusted.paths import check_path
+from improvo.untrusted.paths import check_is_file, check_path
 
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
@@ -29,7 +29,7 @@ def read_text(path: Path, what: str = "text", mend: str = "save it as UTF-8") ->
     Raises:
         InputError: it cannot be read, or is no text.
     """
-    check_path(path)
+    check_is_file(check_path(path))
     try:
         if path.stat().st_size > MAX_TEXT_BYTES:
             raise InputError(f"{path}: cannot be read as {what} (it is too large); {mend}")

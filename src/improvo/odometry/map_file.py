@@ -10,6 +10,7 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.files import written_atomically
 from improvo.types import SparseMap
+from improvo.untrusted.paths import check_is_file
 from improvo.untrusted.text import reason
 
 _FIELDS = (
@@ -54,7 +55,7 @@ def read_map(path: Path) -> SparseMap:
         InputError: missing, damaged, or not written by improvo.
     """
     try:
-        content = path.read_bytes()
+        content = check_is_file(path).read_bytes()
     except (OSError, MemoryError) as error:
         raise InputError(f"{path}: cannot be read ({reason(error)}); `improvo run` writes it") from None
     header, separator, body = content.partition(b"end_header\n")

@@ -10,11 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from improvo.errors import InputError
 from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.grey_levels import SAMPLES, Stretch, stretch_of, to_8_bits
 from improvo.sequences.images import decode, file_bytes
 from improvo.types import UInt8
-from improvo.untrusted.paths import is_text
+from improvo.untrusted.paths import check_is_file, is_text
 
 _HEAD = 1 << 16  # bytes in which a JPEG's orientation stands
 _FLAGS = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
@@ -90,9 +91,9 @@ def orientation(path: Path) -> int:
     if path.suffix.lower() not in (".jpg", ".jpeg", ".jpe", ".jfif"):
         return _PLAIN
     try:
-        with path.open("rb") as file:
+        with check_is_file(path).open("rb") as file:
             head = file.read(_HEAD)
-    except OSError:
+    except (InputError, OSError):
         return _PLAIN
     start = head.find(b"Exif\0\0")
     if not head.startswith(b"\xff\xd8") or start < 0:
@@ -119,9 +120,9 @@ def _may_be_deep(path: Path) -> bool:
     if suffix in (".tif", ".tiff", ".jp2"):
         return True
     try:
-        with path.open("rb") as file:
+        with check_is_file(path).open("rb") as file:
             head = file.read(64)
-    except (OSError, ValueError):  # a name that no system knows: reading it will say so
+    except (InputError, OSError, ValueError):  # a name that no system knows: reading it will say so
         return False
     if head.startswith(b"\x89PNG"):
         return len(head) > 24 and head[24] == 16

@@ -10,10 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from improvo.errors import InputError
 from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.grey_levels import to_8_bits
 from improvo.types import Float32, UInt8
 from improvo.untrusted.limits import MAX_PICTURE_BYTES
+from improvo.untrusted.paths import check_is_file
 from improvo.untrusted.pictures import check_picture
 from improvo.untrusted.text import reason
 
@@ -207,6 +209,10 @@ def file_bytes(path: Path) -> bytes:
     Raises:
         UnreadableFrameError: it cannot be read.
     """
+    try:
+        check_is_file(path)
+    except InputError:
+        raise UnreadableFrameError("is a pipe or a device, not a file") from None
     try:
         if path.stat().st_size > MAX_PICTURE_BYTES:
             raise UnreadableFrameError("the file is too large for a picture")

@@ -17,6 +17,7 @@ from improvo.sequences.base import Recording, UnreadableFrameError
 from improvo.sequences.images import grey, list_images, read_image
 from improvo.sequences.rectification import Rectifier
 from improvo.types import Mask, UInt8
+from improvo.untrusted.paths import check_is_file
 
 BORDER = 6  # delivered pixels around black areas
 _WHITE = 128  # grey level from which on a pixel is used
@@ -118,6 +119,7 @@ def size_of(file: Path) -> tuple[int, int] | None:
     from PIL import Image
 
     try:
+        check_is_file(file)
         with Image.open(file) as image:
             return image.size
     except Exception:  # Pillow raises errors of many kinds

@@ -23,6 +23,7 @@ from improvo.sequences.rates import frame_rate
 from improvo.sequences.registration import intrinsics_of, register_depth, relative_extrinsics
 from improvo.types import Float32, Float64, Trajectory, UInt8
 from improvo.untrusted.names import number_of
+from improvo.untrusted.paths import check_is_file
 
 DEPTH_SCALE = 1000.0
 FPS = 30.0
@@ -138,7 +139,7 @@ class ScanNetFolder(Recording):
 def read_matrix(path: Path) -> Float64:
     """(4, 4) from a text file, NaN if there is none or it holds anything else."""
     try:
-        return _matrix(decoded(path.read_bytes()).replace(",", " ").split())
+        return _matrix(decoded(check_is_file(path).read_bytes()).replace(",", " ").split())
     except (OSError, UnicodeDecodeError):
         return np.full((4, 4), np.nan)
 

@@ -16,6 +16,7 @@ from improvo.geometry.camera_files import Calibration
 from improvo.geometry.text_files import decoded
 from improvo.geometry.trajectory_files import clean_poses
 from improvo.types import Float64, Trajectory
+from improvo.untrusted.paths import check_is_file
 from improvo.untrusted.text import load_json, reason
 
 MAX_VARIATION = 0.01
@@ -74,7 +75,7 @@ def read_json(path: Path, data: bytes | None = None) -> dict[str, Any]:
         InputError: not JSON, or no mapping.
     """
     try:
-        content = load_json(decoded(path.read_bytes() if data is None else data))
+        content = load_json(decoded(check_is_file(path).read_bytes() if data is None else data))
     except (OSError, ValueError, MemoryError) as error:
         raise InputError(f"{path}: cannot be read as JSON ({reason(error)}); export it again") from None
     if not isinstance(content, dict):

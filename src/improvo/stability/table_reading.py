@@ -10,6 +10,7 @@ from improvo.errors import InputError
 from improvo.locations import fetched
 from improvo.untrusted.arrays import check_array
 from improvo.untrusted.limits import MAX_TABLE_BYTES
+from improvo.untrusted.paths import check_is_file
 from improvo.untrusted.text import reason
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def _reading(path: Path, schema: pa.Schema, read: Callable[[Any], Found]) -> Fou
     import pyarrow.parquet as pq
 
     try:
-        with pq.ParquetFile(fetched(path)) as file:
+        with pq.ParquetFile(check_is_file(fetched(path))) as file:
             missing = [name for name in schema.names if name not in file.schema_arrow.names]
             if missing:
                 raise InputError(f"{path}: lacks the column(s) {', '.join(missing)}; write it again with this version")

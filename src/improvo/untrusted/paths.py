@@ -63,3 +63,21 @@ def check_readable(path: Path) -> Path:
     if not os.access(path, os.R_OK | os.X_OK if is_folder else os.R_OK):
         raise InputError(f"{path}: no permission to read it; choose another, or change that")
     return path
+
+
+def check_is_file(path: Path) -> Path:
+    """The path, unless it leads to a pipe or a device: to read one may take forever, and all memory.
+
+    A pipe that a shell hands over as a file (`<(...)`, in `/dev/fd`) has somebody who writes to it.
+
+    Raises:
+        InputError: it does.
+    """
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):  # for whoever reads it to say
+        return path
+    handed_over = stat.S_ISFIFO(mode) and path.parts[:3] == ("/", "dev", "fd")
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or handed_over):
+        raise InputError(f"{path}: is a pipe or a device, not a file; give a file")
+    return path

@@ -15,7 +15,7 @@ from improvo.untrusted.limits import (
     MAX_YAML_BYTES,
     MAX_YAML_NODES,
 )
-from improvo.untrusted.paths import check_readable
+from improvo.untrusted.paths import check_is_file, check_readable
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -79,7 +79,7 @@ def read_json_file(path: Path, mend: str) -> dict[str, Any]:
         FileNotFoundError: there is none.
         InputError: it may not or cannot be read, or is no JSON object.
     """
-    check_readable(path)
+    check_is_file(check_readable(path))
     try:
         if path.stat().st_size > 4 * MAX_JSON_BYTES:
             raise ValueError("it is too large")

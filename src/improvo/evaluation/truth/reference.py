@@ -17,6 +17,7 @@ from improvo.geometry.se3 import inverse, quat_xyzw_from_rotation, rigid, rotati
 from improvo.geometry.text_files import decoded, read_text
 from improvo.geometry.trajectory_files import clean_poses, read_trajectory
 from improvo.types import Float64, Int64
+from improvo.untrusted.paths import check_is_file
 
 UNIT_TOLERANCE = 0.01  # of the norm of a quaternion
 _SIZE = re.compile(r"#\s*images\s+(\d+)x(\d+)\s*$")
@@ -62,7 +63,7 @@ def lacks_times(path: Path) -> bool:
     if path.is_dir():
         return is_colmap_model(path)
     try:
-        return _numbered(decoded(path.read_bytes()).splitlines(), path) is not None
+        return _numbered(decoded(check_is_file(path).read_bytes()).splitlines(), path) is not None
     except (OSError, UnicodeDecodeError):
         return False
 

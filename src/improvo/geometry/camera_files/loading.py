@@ -16,7 +16,7 @@ from improvo.geometry.camera_files.containers import parse_npz, parse_tree
 from improvo.geometry.camera_files.plain_text import from_plain_text, is_plain
 from improvo.geometry.camera_files.tree import cameras
 from improvo.geometry.text_files import read_text
-from improvo.untrusted.paths import check_path
+from improvo.untrusted.paths import check_is_file, check_path
 
 IN_FOLDERS = ("camera.yaml", "camera.yml", "camera.json", "camera.txt")
 _UNSAFE = (".pkl", ".pickle", ".npy", ".mat", ".m", ".py", ".sfm")
@@ -119,6 +119,6 @@ def _in_folder(folder: Path) -> Path:
 
 def _bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return check_is_file(path).read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
