@@ -394,20 +394,34 @@ def validation(right: list[float], tracked: int = 100, segments: int = 1, matche
 def test_better_is_more_right_matches_with_odometry_that_is_no_worse() -> None:
     settings = ValidationSettings()
     start = validation([0.4, 0.5, 0.6] * 5)
-    assert is_better(validation([0.42, 0.51, 0.62] * 5), start, settings)
-    assert not is_better(validation([0.4, 0.5, 0.6] * 5), start, settings)
-    assert not is_better(validation([0.6, 0.4, 0.52] * 5), start, settings)  # more, by chance
+    assert is_better(validation([0.42, 0.51, 0.62] * 5), start, start, settings)
+    assert not is_better(validation([0.4, 0.5, 0.6] * 5), start, start, settings)
+    assert not is_better(validation([0.6, 0.4, 0.52] * 5), start, start, settings)  # more, by chance
     more = [0.7, 0.8, 0.9] * 5
-    assert is_better(validation(more, tracked=99), start, settings)
-    assert not is_better(validation(more, tracked=98), start, settings)
-    assert is_better(validation(more, tracked=98), start, replace(settings, frames_lost=0.05))
-    assert not is_better(validation(more, segments=2), start, settings)
-    assert is_better(validation(more, segments=2), start, replace(settings, segments_more=1))
-    assert is_better(validation(more, matches=90), start, settings)  # wrong ones are lost, and some right ones found
-    assert not is_better(validation(more, matches=60), start, settings)  # right ones are lost too
+    assert is_better(validation(more, tracked=99), start, start, settings)
+    assert not is_better(validation(more, tracked=98), start, start, settings)
+    assert is_better(validation(more, tracked=98), start, start, replace(settings, frames_lost=0.05))
+    assert not is_better(validation(more, segments=2), start, start, settings)
+    assert is_better(validation(more, segments=2), start, start, replace(settings, segments_more=1))
+    assert is_better(
+        validation(more, matches=90), start, start, settings
+    )  # wrong ones are lost, and some right ones found
+    assert not is_better(validation(more, matches=60), start, start, settings)  # right ones are lost too
     nothing = validation([0.4, 0.5, 0.6] * 5, tracked=0, segments=0)
-    assert is_better(validation(more), nothing, settings)  # one segment is no break more than none
-    assert not is_better(validation(more, segments=2), nothing, settings)
+    assert is_better(validation(more), nothing, nothing, settings)  # one segment is no break more than none
+    assert not is_better(validation(more, segments=2), nothing, nothing, settings)
+
+
+def test_a_later_round_is_better_by_its_share_if_it_gains_more_than_chance_over_the_start() -> None:
+    settings = ValidationSettings()
+    start, best = validation([0.4, 0.5, 0.6] * 5), validation([0.42, 0.52, 0.62] * 5)
+    hardly = validation([0.52, 0.47, 0.6] * 5)  # than the best by chance, than the start not
+    assert gain(hardly, best, "right_8px", settings.matches).low < 0
+    assert is_better(hardly, best, start, settings)
+    assert not is_better(best, hardly, start, settings)
+    assert not is_better(validation([0.6, 0.44, 0.55] * 5), best, start, settings)  # than the start by chance, too
+    assert not is_better(validation([0.52, 0.47, 0.6] * 5, matches=60), best, start, settings)
+    assert not is_better(validation([0.52, 0.47, 0.6] * 5, tracked=98), best, start, settings)
 
 
 def test_the_card_has_every_level_where_recordings_share_a_gap() -> None:
@@ -508,8 +522,8 @@ def test_what_makes_an_earlier_recording_worse_is_not_better() -> None:
         return replace(one, scores=(*one.scores, replace(other.scores[0], recording="before/room", earlier=True)))
 
     start = both(0.5, 0.6)
-    assert is_better(both(0.6, 0.6), start, settings)
-    assert is_better(both(0.6, 0.7), start, settings)
-    assert not is_better(both(0.6, 0.58), start, settings)
-    assert not is_better(both(0.5, 0.7), start, settings)
+    assert is_better(both(0.6, 0.6), start, start, settings)
+    assert is_better(both(0.6, 0.7), start, start, settings)
+    assert not is_better(both(0.6, 0.58), start, start, settings)
+    assert not is_better(both(0.5, 0.7), start, start, settings)
     assert both(0.6, 0.2).mean("right_8px") == pytest.approx(0.6)

@@ -121,8 +121,9 @@ def improve(
                     loop.label(teacher, split.training)
                 loop.train(candidate, number, teacher, split.training, teaching)
             validation = loop.validate(candidate, split.held_back, judging)
-            better = is_better(validation, result.validations[result.best], settings.validation)
-            progress.validated(candidate, validation, result.validations[0], settings.validation, better)
+            best, start_values = result.validations[result.best], result.validations[0]
+            better = is_better(validation, best, start_values, settings.validation)
+            progress.validated(candidate, validation, start_values, settings.validation, better)
             result = replace(
                 result,
                 best=number if better else result.best,

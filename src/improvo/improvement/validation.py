@@ -167,28 +167,40 @@ def rule(settings: ValidationSettings) -> str:
     """The decision rule, in a sentence."""
     return (
         f"A frontend is better than the best one before it if a larger share of its matches is right within "
-        f"{settings.matches.right_px[1]:g} pixels on the frames held back, at all gaps together and by more than "
-        f"chance (95 % interval), the number of right ones is not less by more than chance, and the odometry is not "
-        f"worse with it: it loses no more than {100 * settings.frames_lost:g} % of the frames that it tracked with the "
-        f"other, and breaks no more often. "
+        f"{settings.matches.right_px[1]:g} pixels on the frames held back, at all gaps together, and a larger one than "
+        f"at the start by more than chance (95 % interval); if the number of right ones is not less by more than "
+        f"chance; and if the odometry is not worse with it: it loses no more than {100 * settings.frames_lost:g} % of "
+        f"the frames that it tracked with the other, and breaks no more often. "
         f"No recording of an earlier run may be worse by more than chance."
     )
 
 
-def is_better(candidate: Validation, best: Validation, settings: ValidationSettings) -> bool:
+def is_better(candidate: Validation, best: Validation, start: Validation, settings: ValidationSettings) -> bool:
     """Whether a frontend is better than the best one before it; `rule` says it in words.
+
+    That it is better than the start must be more than chance. Between two that are, the one with the larger share is
+    the better guess, although their difference may be chance.
 
     Args:
         candidate: what was measured of it.
         best: what was measured of the best one, on the same frames and pairs.
+        start: what was measured at the start, likewise; the same as `best` for a first round.
         settings: what its odometry may lose.
     """
-    kept = candidate.tracked >= (1 - settings.frames_lost) * best.tracked
-    whole = candidate.segments <= max(best.segments, 1) + settings.segments_more  # none where nothing was tracked
-    name = loose(settings.matches)
-    remembered = all(gain(candidate, best, name, settings.matches, None, one).high >= 0 for one in best.earlier)
-    no_fewer = gain(candidate, best, found(settings.matches), settings.matches).high >= 0
-    return kept and whole and remembered and no_fewer and gain(candidate, best, name, settings.matches).low > 0
+    judge = settings.matches
+    larger = gain(candidate, best, loose(judge), judge).difference > 0
+    gained = gain(candidate, start, loose(judge), judge).low > 0
+    return larger and gained and all(_no_worse(candidate, before, settings) for before in (best, start))
+
+
+def _no_worse(candidate: Validation, before: Validation, settings: ValidationSettings) -> bool:
+    """Whether it loses nothing: no right matches, no frames, no recording of an earlier run."""
+    judge = settings.matches
+    kept = candidate.tracked >= (1 - settings.frames_lost) * before.tracked
+    whole = candidate.segments <= max(before.segments, 1) + settings.segments_more  # none where nothing was tracked
+    no_fewer = gain(candidate, before, found(judge), judge).high >= 0
+    remembered = all(gain(candidate, before, loose(judge), judge, None, one).high >= 0 for one in before.earlier)
+    return kept and whole and no_fewer and remembered
 
 
 def summary(validation: Validation, start: Validation, settings: ValidationSettings) -> dict[str, Any]:
