@@ -10,6 +10,7 @@ import sys
 import threading
 import wave
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -229,8 +230,8 @@ def test_a_file_of_another_kind_is_not_replaced(
     video: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
 ) -> None:
     for command, package in (("truth", "pycolmap"), ("onnx", "onnx"), ("map", "matplotlib")):
-        if command in words:
-            pytest.importorskip(package)
+        if command in words and find_spec(package) is None:  # imported, mujoco would choose its own way to render
+            pytest.skip(f"{package} is not installed")
     other = tmp_path / "holiday.mov"
     other.write_text("precious")
     told = refused(tuple(word.format(video=video, other=other, run=finished) for word in words), capsys)
@@ -303,8 +304,8 @@ def test_two_commands_at_once_on_one_folder(
     words: tuple[str, ...], walk: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for command, package in (("simulate", "mujoco"), ("features", "h5py")):
-        if command in words:
-            pytest.importorskip(package)
+        if command in words and find_spec(package) is None:  # imported, mujoco would choose its own way to render
+            pytest.skip(f"{package} is not installed")
     out = tmp_path / "out"
     make_output_folder(out, " ".join(words[:2]) if words[0] == "export" else words[0])
     holds, done = threading.Event(), threading.Event()
@@ -505,7 +506,7 @@ def test_numbers_out_of_range(words: tuple[str, ...], says: str, capsys: pytest.
         (("--seed", "-1"), "seed=-1: must be 0 or more, and less than 4294967296"),
         (("--seed", "99999999999999999999"), "must be 0 or more, and less than 4294967296"),
         (("--set", "odometry.tolerance=.inf"), "`odometry.tolerance`: inf is no finite number"),
-        (("--set", "odometry.matching.max_distance=.nan"), "`odometry.matching.max_distance`: nan is no finite number"),
+        (("--set", "odometry.matching.max_distance=.nan"), "matching.max_distance=nan: must be positive"),
         (("--fps", "inf"), "`sequence.fps`: inf is no finite number"),
         (("--fps", "1e-300"), "fps 1e-300 is no number of frames a second"),
     ],
