@@ -19,7 +19,7 @@ from improvo.frontend.settings import FrontendSettings
 from improvo.geometry.camera import Camera
 from improvo.improvement.estimate import Costs, Estimate, estimate, refuse_full_disk
 from improvo.improvement.gaps import choose_gaps, median_overlap
-from improvo.improvement.plan import usual_rounds
+from improvo.improvement.plan import first_estimate, usual_rounds
 from improvo.improvement.recipe import steps_of
 from improvo.improvement.reference import (
     HELD_BACK,
@@ -178,19 +178,21 @@ def test_every_labelling_is_in_the_estimate(changes: dict[str, Any], rounds: int
     [(3, 2, 2), (20, 8, 2), (20, 11, 1), (29, 9, 2), (29, 16, 1), (60, 29, 2), (60, 31, 1)],  # of minutes
 )
 def test_rounds_that_are_not_asked_for_take_half_an_hour_or_add_half_to_the_first(
-    first: float, each: float, rounds: int, monkeypatch: pytest.MonkeyPatch
+    first: float, each: float, rounds: int
 ) -> None:
     controls = []
 
-    def said(sequences: object, settings: ImproveSettings, number: int, evaluate: object) -> Estimate:
+    def said(settings: ImproveSettings, number: int) -> Estimate:
         controls.append(settings.control)
         return Estimate(first + (number - 1) * each, 0, 0, 0, 0, 0)
 
-    monkeypatch.setattr("improvo.improvement.plan.first_estimate", said)
-    assert usual_rounds([], replace(ImproveSettings(), control=True)) == rounds
+    assert usual_rounds(replace(ImproveSettings(), control=True), said) == rounds
     assert not any(controls)  # which may be added later
-    monkeypatch.setattr("improvo.improvement.plan.first_estimate", lambda *_: None)
-    assert usual_rounds([], ImproveSettings()) == 1  # nothing can be read, which will be said
+
+
+def test_where_nothing_can_be_read_it_is_one_round_and_the_loop_says_so(tmp_path: Path) -> None:
+    assert first_estimate([tmp_path / "missing"], ImproveSettings(), None) == (1, None)
+    assert first_estimate([tmp_path / "missing"], ImproveSettings(), 3) == (3, None)
 
 
 def test_a_control_has_as_many_rounds() -> None:

@@ -20,7 +20,7 @@ from improvo.frontend.weights import load_weights, save_weights
 from improvo.improvement.earlier import earlier_runs
 from improvo.improvement.estimate import refuse_full_disk
 from improvo.improvement.folder import COMMAND, Candidate, ImproveFolder
-from improvo.improvement.plan import first_estimate, usual_rounds
+from improvo.improvement.plan import first_estimate
 from improvo.improvement.progress import ImprovementProgress
 from improvo.improvement.recipe import Train, TrainingJob
 from improvo.improvement.reference import HELD_BACK, TRAINING, ReferencePart
@@ -94,8 +94,7 @@ def improve(
     first_weights = earlier.first_weights(settings.frontend.name)
     make_output_folder(output, COMMAND)
     with locked(output):
-        most = rounds or usual_rounds(sequences, settings, evaluate)
-        needed = first_estimate(sequences, settings, most, evaluate)
+        most, needed = first_estimate(sequences, settings, rounds, evaluate)
         if needed is not None:
             progress.line(f"estimate: {needed.words}, {'' if rounds else 'up to '}{counted(most, 'round')}")
             refuse_full_disk(output, needed)  # before the settings are recorded, which fewer steps would contradict

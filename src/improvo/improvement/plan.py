@@ -65,7 +65,7 @@ def plan_improvement(
     frontend = replace(settings.frontend, name=str(weights))
     paths = list(dict.fromkeys([*sequences, *evaluate]))
     pixels = _pixels(paths, settings)
-    rounds = rounds or usual_rounds(sequences, settings, evaluate)
+    rounds = rounds or first_estimate(sequences, settings, None, evaluate)[0]
     with tempfile.TemporaryDirectory(prefix="improvo-plan-") as folder:
         store = Path(folder) / "labels"
         run_settings = settings.run_settings(settings.sequence, frontend)
@@ -79,31 +79,17 @@ def plan_improvement(
     return ImprovePlan(once, needed, rounds, measured is not None)
 
 
-def usual_rounds(sequences: Sequence[Path], settings: ImproveSettings, evaluate: Sequence[Path] = ()) -> int:
-    """How many rounds the loop makes at most where none are asked for: what fits in half an hour, or costs little more.
-
-    Known from the lengths of the recordings alone, and whether there is a control or not, so that a run that was
-    stopped goes on as it was begun.
-
-    Args:
-        sequences, settings, evaluate: see `improve`.
-    """
-    settings = replace(settings, control=False)
-    needed = [first_estimate(sequences, settings, rounds, evaluate) for rounds in range(1, _MOST_ROUNDS + 1)]
-    minutes = [each.minutes for each in needed if each is not None]
-    return sum(each <= max(_USUAL_MINUTES, _AND_A_HALF * minutes[0]) for each in minutes) or 1
-
-
 def first_estimate(
-    sequences: Sequence[Path], settings: ImproveSettings, rounds: int, evaluate: Sequence[Path] = ()
-) -> Estimate | None:
+    sequences: Sequence[Path], settings: ImproveSettings, rounds: int | None, evaluate: Sequence[Path] = ()
+) -> tuple[int, Estimate | None]:
     """What all of it takes, from the lengths of the recordings alone; nothing of what is done already is taken off.
 
     Args:
         sequences, settings, rounds, evaluate: see `improve`.
 
     Returns:
-        None where no recording can be opened, which the loop itself will say.
+        How many rounds there are at most, and what they take: None where no recording can be opened, which the loop
+        itself will say.
     """
     named = {path.resolve() for path in evaluate}
     training = held_back = 0
@@ -116,12 +102,32 @@ def first_estimate(
         held_back = round(training * settings.split.share)
         training -= held_back
     if training + held_back == 0:
-        return None
+        return rounds or 1, None
     paths = [*sequences, *evaluate]
     pixels = _pixels(paths, settings)
     costs = Costs.usual(pixels, _parameters(starting_weights(settings.frontend.name)))
     whole = len(evaluate) or whole_held_back(len(paths), settings.split.share)
-    return estimate(settings, rounds, training, held_back, pixels, costs, whole)
+
+    def needed(settings: ImproveSettings, rounds: int) -> Estimate:
+        return estimate(settings, rounds, training, held_back, pixels, costs, whole)
+
+    most = rounds or usual_rounds(settings, needed)
+    return most, needed(settings, most)
+
+
+def usual_rounds(settings: ImproveSettings, needed: Callable[[ImproveSettings, int], Estimate]) -> int:
+    """How many rounds the loop makes at most where none are asked for: what fits in half an hour, or costs little more.
+
+    Known from the lengths of the recordings alone, and whether there is a control or not, so that a run that was
+    stopped goes on as it was begun.
+
+    Args:
+        settings: of the loop.
+        needed: estimates so many rounds.
+    """
+    settings = replace(settings, control=False)
+    minutes = [needed(settings, rounds).minutes for rounds in range(1, _MOST_ROUNDS + 1)]
+    return sum(each <= max(_USUAL_MINUTES, _AND_A_HALF * minutes[0]) for each in minutes)
 
 
 def _parameters(weights: Path) -> int:
