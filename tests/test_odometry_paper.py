@@ -13,8 +13,7 @@ from improvo.geometry import se3
 from improvo.odometry import paper
 from improvo.odometry.settings import PAPER, OdometrySettings
 from improvo.odometry.states import TrackingState
-from improvo.odometry.trajectory_builder import FinalView
-from improvo.odometry.view import View
+from improvo.odometry.view import FinalView, View
 from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
 from improvo.types import Features, Float64
 

@@ -15,8 +15,7 @@ from improvo.odometry.alarms.second_map import SecondOpinion
 from improvo.odometry.mapping.initial_pair import InitFailure
 from improvo.odometry.settings import BridgingSettings, OdometrySettings
 from improvo.odometry.states import TrackingState
-from improvo.odometry.trajectory_builder import FinalView
-from improvo.odometry.view import View
+from improvo.odometry.view import FinalView, View
 from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
 from improvo.types import Features
 

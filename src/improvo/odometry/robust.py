@@ -21,8 +21,8 @@ from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import StateMachine, TrackingState
 from improvo.odometry.verdict.judging import SegmentJudge
-from improvo.odometry.view import Mask, View
-from improvo.types import Float64
+from improvo.odometry.view import View
+from improvo.types import Float64, Mask
 
 _CARRIED = 0.2  # share of the observations that turned out to move with the camera; with more the map is wrong
 _MAX_BUFFERED = 300  # frames in the initialisation buffer; the oldest leaves it without a pose
