@@ -24,7 +24,7 @@ from improvo.odometry.verdict.judging import SegmentJudge
 from improvo.odometry.view import View
 from improvo.types import Float64, Mask
 
-_CARRIED = 0.2  # share of the observations that turned out to move with the camera; with more the map is wrong
+_MOST_ATTACHED = 0.2  # share of a map's observations that turn out to move with the camera; with more it is wrong
 _MAX_BUFFERED = 300  # frames in the initialisation buffer; the oldest leaves it without a pose
 _LOST = "lost"  # why a segment ended
 _TWO_VIEWS, _ATTACHED = "two-view geometry", "what moves with the camera"  # what contradicted it
@@ -52,7 +52,7 @@ class RobustMapper(Mapper):
         self._worlds = 0  # maps started
         self._lens = LensWatch(camera, settings.tolerance, settings.seed)
         self._contradicted = 0  # maps in a row by two-view geometry, each over frames of the one before
-        self._carried = False  # a large part of the map has turned out to move with the camera
+        self._map_is_attached = False  # a large part of it has turned out to move with the camera
         self._second_opinion = SecondOpinion(camera, settings, descriptor_distance, events)
         self._window = SlidingWindow(settings.window, camera.width)
         self._two_view_check = TwoViewCheck(camera, settings, descriptor_distance)
@@ -78,8 +78,8 @@ class RobustMapper(Mapper):
                 self._leave_out_attached(view, self._buffer)
             self._initialise(view)
             return
-        if newly_attached and self._leave_out_attached(view, [*self._map.history, *self._buffer]) > _CARRIED:
-            self._carried = True
+        if newly_attached and self._leave_out_attached(view, [*self._map.history, *self._buffer]) > _MOST_ATTACHED:
+            self._map_is_attached = True
         if self._lens.changed(self._window.newest, view, self._map.store.xyz):
             self._events.focal_length(view.frame_index, self._lens.factor, "the segment ends")
             self._end_segment("the focal length changed")
@@ -95,7 +95,7 @@ class RobustMapper(Mapper):
         report = self._adjust_window(self._map)
         self._map.remember(view)
         self._result.add_window(report)
-        if self._carried:
+        if self._map_is_attached:
             self._start_anew(view, _ATTACHED)
             return
         history = {earlier.frame_index: earlier for earlier in self._map.history}
@@ -318,4 +318,4 @@ class RobustMapper(Mapper):
         self._window = SlidingWindow(self._settings.window, self._camera.width)
         self._provisional = []
         self._cooldown, self._costly_failures = 0, 0
-        self._carried = False
+        self._map_is_attached = False
