@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -77,6 +77,10 @@ class Validation:
         """Mean of a value over the pairs of a gap, or of all gaps with the same weight."""
         chosen = [scores for scores in self.own if level in (None, scores.level)]
         return float(np.mean([np.mean(scores.values[name]) for scores in chosen]))
+
+    def pairs(self, level: int) -> int:
+        """How many pairs of frames there are of a gap."""
+        return sum(len(scores.pairs) for scores in self.own if scores.level == level)
 
     def gap_words(self, level: int) -> str:
         """The gap in frames and seconds, for a person; the range of it over the recordings."""
@@ -163,20 +167,31 @@ def gain(
     return Gain(compared["first"], compared["second"], *compared["interval"])
 
 
-def rule(settings: ValidationSettings) -> str:
-    """The decision rule, in a sentence."""
-    return (
+def gain_words(validation: Validation, before: Validation, settings: SelfTruthSettings) -> str:
+    """The gain in right matches, all gaps together: in their share, which decides, and in their number."""
+    share, number = (gain(validation, before, name, settings).words for name in (loose(settings), found(settings)))
+    return f"share of right matches {share}; their number {number}"
+
+
+def rule(settings: ValidationSettings, earlier: bool = False) -> str:
+    """The decision rule, in words.
+
+    Args:
+        settings: of the validation.
+        earlier: whether there are recordings of earlier runs.
+    """
+    words = (
         f"A frontend is better than the best one before it if a larger share of its matches is right within "
         f"{settings.matches.right_px[1]:g} pixels on the frames held back, at all gaps together, and a larger one than "
         f"at the start by more than chance (95 % interval); if the number of right ones is not less by more than "
         f"chance; and if the odometry is not worse with it: it loses no more than {100 * settings.frames_lost:g} % of "
-        f"the frames that it tracked with the other, and breaks no more often. "
-        f"No recording of an earlier run may be worse by more than chance."
+        f"the frames that it tracked with the other, and breaks no more often."
     )
+    return f"{words} No recording of an earlier run may be worse by more than chance." if earlier else words
 
 
-def is_better(candidate: Validation, best: Validation, start: Validation, settings: ValidationSettings) -> bool:
-    """Whether a frontend is better than the best one before it; `rule` says it in words.
+def why_not_better(candidate: Validation, best: Validation, start: Validation, settings: ValidationSettings) -> str:
+    """What a frontend lacks to be better than the best one before it, in words; empty where it is. `rule` is the rule.
 
     That it is better than the start must be more than chance. Between two that are, the one with the larger share is
     the better guess, although their difference may be chance.
@@ -188,19 +203,34 @@ def is_better(candidate: Validation, best: Validation, start: Validation, settin
         settings: what its odometry may lose.
     """
     judge = settings.matches
-    larger = gain(candidate, best, loose(judge), judge).difference > 0
-    gained = gain(candidate, start, loose(judge), judge).low > 0
-    return larger and gained and all(_no_worse(candidate, before, settings) for before in (best, start))
+    faults = []
+    if not gain(candidate, best, loose(judge), judge).difference > 0:
+        faults.append(f"the share of right matches is no larger than {_named(best, start)}")
+    elif not gain(candidate, start, loose(judge), judge).low > 0:
+        faults.append("that the share of right matches is larger than at the start may be chance")
+    for before in (start,) if best is start else (start, best):
+        faults += _losses(candidate, before, start, settings)
+    return "; ".join(faults)
 
 
-def _no_worse(candidate: Validation, before: Validation, settings: ValidationSettings) -> bool:
-    """Whether it loses nothing: no right matches, no frames, no recording of an earlier run."""
-    judge = settings.matches
-    kept = candidate.tracked >= (1 - settings.frames_lost) * before.tracked
-    whole = candidate.segments <= max(before.segments, 1) + settings.segments_more  # none where nothing was tracked
-    no_fewer = gain(candidate, before, found(judge), judge).high >= 0
-    remembered = all(gain(candidate, before, loose(judge), judge, None, one).high >= 0 for one in before.earlier)
-    return kept and whole and no_fewer and remembered
+def _losses(
+    candidate: Validation, before: Validation, start: Validation, settings: ValidationSettings
+) -> Iterator[str]:
+    """What it loses: right matches, frames, or what was known of a recording of an earlier run."""
+    judge, than = settings.matches, _named(before, start)
+    if gain(candidate, before, found(judge), judge).high < 0:
+        yield f"fewer matches are right than {than}"
+    if candidate.tracked < (1 - settings.frames_lost) * before.tracked:
+        yield f"fewer frames are tracked than {than} ({before.tracked})"
+    if candidate.segments > max(before.segments, 1) + settings.segments_more:  # none where nothing was tracked
+        yield f"the odometry breaks more often than {than}"
+    for one in before.earlier:
+        if gain(candidate, before, loose(judge), judge, None, one).high < 0:
+            yield f"{one} is worse than {than}"
+
+
+def _named(before: Validation, start: Validation) -> str:
+    return "at the start" if before is start else "with the best round before"
 
 
 def summary(validation: Validation, start: Validation, settings: ValidationSettings) -> dict[str, Any]:
