@@ -25,7 +25,15 @@ from improvo.frontend.weights import load_weights
 from improvo.improvement.improve import Improvement
 from improvo.improvement.progress import ImprovementProgress
 from improvo.improvement.settings import ImproveSettings, ValidationSettings
-from improvo.improvement.validation import GapScores, Validation, gain, is_better, read_validation, rule, summary
+from improvo.improvement.validation import (
+    GapScores,
+    Validation,
+    gain,
+    read_validation,
+    rule,
+    summary,
+    why_not_better,
+)
 from improvo.labeling.labeled import read_labels
 
 EXAMPLE = Path(__file__).with_name("improvement_example.py")
@@ -104,7 +112,7 @@ def test_the_best_weights_are_kept_and_the_report_is_there(
     assert "Kept: round 1; " in page
     assert page.count("data:image/png") == 4  # matches and labels of the start and of the best
     assert any(line.startswith("round 1: ") and line.endswith("better, kept") for line in lines)
-    assert any(line.startswith("round 2: ") and line.endswith("not better, not kept") for line in lines)
+    assert any(line.startswith("round 2: ") and line.endswith("), not kept") for line in lines)
 
 
 def test_no_better_round_leaves_the_start_and_says_so(walk: Path, tmp_path: Path) -> None:
@@ -186,8 +194,8 @@ def test_the_control_is_judged_like_a_round_and_never_kept(walk: Path, tmp_path:
 def test_the_control_has_as_many_rounds_and_steps_as_what_is_kept(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    verdicts = iter([True, True, False])
-    monkeypatch.setattr("improvo.improvement.improve.is_better", lambda *_: next(verdicts))
+    verdicts = iter(["", "", "a fault"])
+    monkeypatch.setattr("improvo.improvement.improve.why_not_better", lambda *_: next(verdicts))
     training, out = FakeTraining((0.0,)), tmp_path / "out"
     settings = replace(SETTINGS, control=True)
     result = run(out, [walk], training, rounds=3, settings=settings)
@@ -391,6 +399,10 @@ def validation(right: list[float], tracked: int = 100, segments: int = 1, matche
     return Validation(100, tracked, segments, 8.0, 0.8, 0.5, {}, (scores,))
 
 
+def is_better(candidate: Validation, best: Validation, start: Validation, settings: ValidationSettings) -> bool:
+    return not why_not_better(candidate, best, start, settings)
+
+
 def test_better_is_more_right_matches_with_odometry_that_is_no_worse() -> None:
     settings = ValidationSettings()
     start = validation([0.4, 0.5, 0.6] * 5)
@@ -420,6 +432,34 @@ def test_more_right_matches_are_better_where_their_share_is_the_same_and_the_oth
     assert not is_better(validation([0.39, 0.49, 0.59] * 5, matches=110), start, start, settings)  # a smaller share
     assert is_better(validation([0.408, 0.51, 0.612] * 5, matches=100), start, start, settings)
     assert not is_better(validation([0.41, 0.51, 0.61] * 5, matches=95), start, start, settings)  # fewer right ones
+
+
+def test_what_is_not_better_is_told_why() -> None:
+    settings = ValidationSettings()
+    start, best = validation([0.4, 0.5, 0.6] * 5), validation([0.5, 0.6, 0.7] * 5)
+    assert why_not_better(best, start, start, settings) == ""
+    for candidate, before, words in (
+        (start, start, "number and share of right matches together are no larger than at the start"),
+        (
+            validation([0.45, 0.55, 0.65] * 5),
+            best,
+            "number and share of right matches together are no larger than with the best round before; "
+            "fewer matches are right than with the best round before; "
+            "a smaller share of the matches is right than with the best round before",
+        ),
+        (
+            validation([0.6, 0.4, 0.52] * 5),
+            start,
+            "that right matches gained in number or share over the start may be chance",
+        ),
+        (validation([0.7, 0.8, 0.9] * 5, tracked=90), start, "fewer frames are tracked than at the start (100)"),
+        (
+            validation([0.7, 0.8, 0.9] * 5, segments=2, matches=60),
+            start,
+            "fewer matches are right than at the start; the odometry breaks more often than at the start",
+        ),
+    ):
+        assert why_not_better(candidate, before, start, settings) == words
 
 
 def test_a_later_round_is_better_by_its_sum_if_it_gains_more_than_chance_over_the_start() -> None:
