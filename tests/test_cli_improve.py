@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,10 @@ def test_improve_says_what_it_did_and_where_the_result_is(
     assert f"weights in {out / 'weights.safetensors'}" in text
     assert (out / "report.html").is_file()
     assert [call["seed"] for call in training.calls] == [7]
+    assert main([*words, "--json"]) == 0  # from what is there
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["weights"] == str(out / "weights.safetensors")
+    assert figures["kept"] in ("start", "round-1")
     settings = yaml.safe_load((out / "settings.yaml").read_text())
     for recipe in ("held", "training"):
         assert settings[recipe]["optimiser"]["steps"] == 90

@@ -86,9 +86,9 @@ class ImprovementProgress:
             f"{candidate.name}: {shares} of its matches are right within {settings.matches.right_px[1]:g} px at {gaps}"
         )
         if validation is not start:
-            text += f"; all gaps together, {gain_words(validation, start, settings.matches)}"
+            text += f"; all gaps against the start: {gain_words(validation, start, settings.matches)}"
             for one in validation.earlier:
-                text += f"; {one} {gain(validation, start, name, settings.matches, earlier=one).words}"
+                text += f"; {one}, share: {gain(validation, start, name, settings.matches, earlier=one).words}"
         text += f"; {validation.tracked} of {validation.frames} frames tracked in "
         text += counted(validation.segments, "segment")
         if faults is not None:

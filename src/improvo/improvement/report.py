@@ -9,10 +9,11 @@ from pathlib import Path
 from improvo.errors import InputError
 from improvo.files import write_png
 from improvo.frontend.weights import load_weights
+from improvo.improvement.decision import rule, why_not_better
 from improvo.improvement.folder import Candidate
 from improvo.improvement.settings import ImproveSettings, ValidationSettings
 from improvo.improvement.split import Part, Split
-from improvo.improvement.validation import Validation, found, gain, gain_words, loose, rule, strict, why_not_better
+from improvo.improvement.validation import Validation, found, gain, gain_words, loose, strict
 from improvo.labeling.store import DONE, read_records
 from improvo.report.improvement_page import Measure, Round, write_improvement_page
 from improvo.sequences import open_sequence
@@ -186,7 +187,7 @@ def _verdict(
     start, how = validations[0], settings.validation
     words = ""
     if best:
-        words += f"Kept: {candidates[best].name}; against the start, all gaps together: "
+        words += f"Kept: {candidates[best].name}; against the start: "
         words += f"{gain_words(validations[best], start, how.matches)}."
     elif len(candidates) > 1:
         words += "No round was better than the start: the weights kept are those at the start, unchanged."

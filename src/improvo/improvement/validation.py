@@ -1,8 +1,8 @@
-"""What is known of a frontend on what was held back, and which of two is better."""
+"""What is known of a frontend on what was held back, and what it adds to another one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -104,6 +104,11 @@ class Gain:
         return self.after - self.before
 
     @property
+    def relative(self) -> float:
+        """The difference as a part of what was before; of one where nothing was."""
+        return self.difference / (self.before if self.before > 0 else 1.0)
+
+    @property
     def words(self) -> str:
         """In per cent of what it was before, with the interval."""
         value, interval = self._parts
@@ -124,7 +129,7 @@ class Gain:
 
 
 def loose(settings: SelfTruthSettings) -> str:
-    """The value that decides: the share of matches that are right within the wider limit."""
+    """One of the two values that decide: the share of matches that are right within the wider limit."""
     return f"right_{settings.right_px[1]:g}px"
 
 
@@ -134,7 +139,7 @@ def strict(settings: SelfTruthSettings) -> str:
 
 
 def found(settings: SelfTruthSettings) -> str:
-    """How many matches of a pair are right within the wider limit: a share also rises where wrong ones are lost."""
+    """The other: how many matches of a pair are right within it; a share also rises where wrong ones are lost."""
     return f"found_{settings.right_px[1]:g}px"
 
 
@@ -167,70 +172,10 @@ def gain(
     return Gain(compared["first"], compared["second"], *compared["interval"])
 
 
-def gain_words(validation: Validation, before: Validation, settings: SelfTruthSettings) -> str:
-    """The gain in right matches, all gaps together: in their share, which decides, and in their number."""
-    share, number = (gain(validation, before, name, settings).words for name in (loose(settings), found(settings)))
-    return f"share of right matches {share}; their number {number}"
-
-
-def rule(settings: ValidationSettings, earlier: bool = False) -> str:
-    """The decision rule, in words.
-
-    Args:
-        settings: of the validation.
-        earlier: whether there are recordings of earlier runs.
-    """
-    words = (
-        f"A frontend is better than the best one before it if a larger share of its matches is right within "
-        f"{settings.matches.right_px[1]:g} pixels on the frames held back, at all gaps together, and a larger one than "
-        f"at the start by more than chance (95 % interval); if the number of right ones is not less by more than "
-        f"chance; and if the odometry is not worse with it: it loses no more than {100 * settings.frames_lost:g} % of "
-        f"the frames that it tracked with the other, and breaks no more often."
-    )
-    return f"{words} No recording of an earlier run may be worse by more than chance." if earlier else words
-
-
-def why_not_better(candidate: Validation, best: Validation, start: Validation, settings: ValidationSettings) -> str:
-    """What a frontend lacks to be better than the best one before it, in words; empty where it is. `rule` is the rule.
-
-    That it is better than the start must be more than chance. Between two that are, the one with the larger share is
-    the better guess, although their difference may be chance.
-
-    Args:
-        candidate: what was measured of it.
-        best: what was measured of the best one, on the same frames and pairs.
-        start: what was measured at the start, likewise; the same as `best` for a first round.
-        settings: what its odometry may lose.
-    """
-    judge = settings.matches
-    faults = []
-    if not gain(candidate, best, loose(judge), judge).difference > 0:
-        faults.append(f"the share of right matches is no larger than {_named(best, start)}")
-    elif not gain(candidate, start, loose(judge), judge).low > 0:
-        faults.append("that the share of right matches is larger than at the start may be chance")
-    for before in (start,) if best is start else (start, best):
-        faults += _losses(candidate, before, start, settings)
-    return "; ".join(faults)
-
-
-def _losses(
-    candidate: Validation, before: Validation, start: Validation, settings: ValidationSettings
-) -> Iterator[str]:
-    """What it loses: right matches, frames, or what was known of a recording of an earlier run."""
-    judge, than = settings.matches, _named(before, start)
-    if gain(candidate, before, found(judge), judge).high < 0:
-        yield f"fewer matches are right than {than}"
-    if candidate.tracked < (1 - settings.frames_lost) * before.tracked:
-        yield f"fewer frames are tracked than {than} ({before.tracked})"
-    if candidate.segments > max(before.segments, 1) + settings.segments_more:  # none where nothing was tracked
-        yield f"the odometry breaks more often than {than}"
-    for one in before.earlier:
-        if gain(candidate, before, loose(judge), judge, None, one).high < 0:
-            yield f"{one} is worse than {than}"
-
-
-def _named(before: Validation, start: Validation) -> str:
-    return "at the start" if before is start else "with the best round before"
+def gain_words(validation: Validation, start: Validation, settings: SelfTruthSettings) -> str:
+    """What right matches gained over the start in number and share, all gaps together."""
+    number, share = (gain(validation, start, name(settings), settings) for name in (found, loose))
+    return f"right matches {number.cell}, their share {share.cell} (95 % intervals)"
 
 
 def summary(validation: Validation, start: Validation, settings: ValidationSettings) -> dict[str, Any]:
