@@ -185,24 +185,24 @@ def _verdict(
     control: tuple[Candidate, Validation] | None,
 ) -> str:
     start, how = validations[0], settings.validation
-    words = ""
+    lines = []
     if best:
-        words += f"Kept: {candidates[best].name}; against the start: "
-        words += f"{gain_words(validations[best], start, how.matches)}."
+        gained = gain_words(validations[best], start, how.matches)
+        lines.append(f"Kept: {candidates[best].name}; against the start: {gained}.")
     elif len(candidates) > 1:
-        words += "No round was better than the start: the weights kept are those at the start, unchanged."
+        lines.append("No round was better than the start: the weights kept are those at the start, unchanged.")
     before = start
     for candidate, validation in zip(candidates[1:], validations[1:], strict=True):
         faults = why_not_better(validation, before, start, how)
         if faults:
-            words += (
-                f" {candidate.name.capitalize()} is not kept ({faults}): {gain_words(validation, start, how.matches)}."
-            )
+            gained = gain_words(validation, start, how.matches)
+            lines.append(f"{candidate.name.capitalize()} is not kept: {faults}. Against the start: {gained}.")
         before = before if faults else validation
     if control:
-        words += " The control, trained for as many rounds and steps on the same frames by homographies alone: "
-        words += f"{gain_words(control[1], start, how.matches)}."
-    return f"{words} {rule(how, bool(start.earlier))}".strip()
+        gained = gain_words(control[1], start, how.matches)
+        words = "The control, trained for as many rounds and steps on the same frames by homographies alone"
+        lines.append(f"{words}: {gained}.")
+    return "\n".join([*lines, rule(how, bool(start.earlier))])
 
 
 def _notes(
