@@ -67,7 +67,7 @@ def _losses(
         yield f"the odometry breaks more often than {than}"
     for one in before.earlier:
         if gain(candidate, before, loose(judge), judge, None, one).high < 0:
-            yield f"{one} is worse than {than}, by more than chance"
+            yield f"in {one} a smaller share of its matches is right than {than}, by more than chance"
 
 
 def _named(before: Validation, start: Validation) -> str:
