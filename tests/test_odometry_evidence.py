@@ -10,7 +10,8 @@ from simulated_features import CAMERA, hand_motion, room
 
 from improvo.geometry import se3
 from improvo.odometry.settings import VerdictSettings
-from improvo.odometry.verdict.evidence import PARTS, EvidenceCheck, Spread, error_percent
+from improvo.odometry.verdict.evidence import PARTS, EvidenceCheck, Spread
+from improvo.odometry.verdict.path_error import error_percent
 from improvo.odometry.verdict.verdict import DOUBTFUL, RIGHT, estimated_error, judge
 from improvo.odometry.view import View
 from improvo.types import Float64

@@ -11,9 +11,11 @@ import numpy as np
 from improvo.odometry.gates import SAME_SCALE
 from improvo.odometry.settings import VerdictSettings
 from improvo.odometry.verdict.evidence import HALVES, PARTS, QUARTERS, Spread
+from improvo.odometry.verdict.seen_again import SeenAgain
 from improvo.types import Float64
 
-_SCALE_SHARE = 40.0  # % of the path that a change of scale by the factor e moves (calibrated: docs/odometry.md)
+_SCALE_FACTOR = 5.0  # times what the parts disagree about the scale by (calibrated: docs/robustness-odometry.md)
+_COVERAGE = 1.25  # times the spread, for what all parts are off by together (calibrated in the same place)
 _USUAL_NOISE = 0.0016  # share of the picture's width; the estimate grows with noise that is larger
 _USUAL_SHARED = 0.0007  # the same of what neighbours are off by together: up to 0.0006 by a camera known roughly
 _USUAL_VIEWS = 4.0  # keyframes that observe a point; more of them average the noise
@@ -93,6 +95,7 @@ def judge(
         evidence = [*alarms, *suspicions, _in_words(spread, error)]
     evidence += [words for words in of_lens[:1] if words not in alarms]
     evidence += [f"frames {first} to {last}: the scale is not determined" for first, last in uncertain]
+    evidence += [_said_of_leap(gap) for gap in spread.leaps]
     return Verdict(word, error, spread.noise_px, tuple(evidence), uncertain, float("nan") if alarms else limit)
 
 
@@ -138,24 +141,30 @@ def joined(first: Verdict, second: Verdict, scale_error: float, paths: tuple[flo
 def estimated_error(spread: Spread) -> float:
     """Error of the segment's positions after Sim3, % of its path.
 
-    The root sum of squares of what the paths of the parts differ by, and of what the least certain change of scale
-    moves. Of the two halves of the points the better one counts twice: the other can have too few by chance. Unusual
-    noise is worse than its spread: what does not fit is dropped, so what stays agrees with what is wrong. So is what
-    neighbours are off by together, which is no noise of keypoints at all: the map follows several motions. Where a
-    point is seen by more keyframes than usual, both are averaged over its views, as by the square root of their number.
+    The root sum of squares of what the paths of the parts differ by, and of what their disagreement about the scale
+    moves at each link. Of the two halves of the points the better one counts twice: the other can have too few by
+    chance. Unusual noise is worse than its spread: what does not fit is dropped, so what stays agrees with what is
+    wrong. So is what neighbours are off by together, which is no noise of keypoints at all: the map follows several
+    motions. Where a point is seen by more keyframes than usual, both are averaged over its views, as by the square root
+    of their number.
     """
     averaged = min(float(np.sqrt(_USUAL_VIEWS / max(spread.views_per_point, 1.0))), 1.0)
     noise = averaged * np.nan_to_num(spread.noise_px) / (_USUAL_NOISE * spread.width)
     shared = averaged * spread.shared_px / (_USUAL_SHARED * spread.width)
     quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
-    scale = _SCALE_SHARE * float(_scale_errors(spread).max(initial=0.0))
+    scale = float(np.linalg.norm(_moved_by_scale(spread)))
     spreads = (quarters**2).sum() + len(HALVES) * halves.min() ** 2 + scale**2
-    return float(max(noise, shared, 1.0) ** _NOISE_POWER * np.sqrt(spreads))
+    return float(_COVERAGE * max(noise, shared, 1.0) ** _NOISE_POWER * np.sqrt(spreads))
 
 
 def _scale_errors(spread: Spread) -> Float64:
     """(L,) how much the parts change the scale across each link, median of the absolute logarithms."""
     return np.asarray(np.median(np.abs(spread.scale_steps), axis=1), np.float64)
+
+
+def _moved_by_scale(spread: Spread) -> Float64:
+    """(L,) % of the path that the disagreement of the parts about the scale moves its positions, by each link."""
+    return np.asarray(_SCALE_FACTOR * spread.leverage * _scale_errors(spread), np.float64)
 
 
 def _said_of_lens(spread: Spread) -> tuple[str, ...]:
@@ -191,6 +200,12 @@ def _said_of_turning(spread: Spread) -> tuple[str, ...]:
     return (f"a camera that only turns, {fov:.0f} degrees wide, explains it as well, and how wide it is was a guess",)
 
 
+def _said_of_leap(gap: SeenAgain) -> str:
+    first, last = gap.frames
+    seen = f"{gap.found} of {gap.expected} points that should be are seen again"
+    return f"frames {first} to {last}: the place may only look like the one before, {seen}"
+
+
 def _told(first: int, last: int, words: str) -> str:
     return f"frames {first} to {last} fit best if the focal length {words}: a zoom, a wrong calibration, or a mover"
 
@@ -217,9 +232,10 @@ def _in_words(spread: Spread, error: float) -> str:
         words += f"the points are {spread.noise_px:.1f} pixels off, and "
     if spread.shared_px > 1.25 * _USUAL_SHARED * spread.width:
         words += f"parts of the picture are off by {spread.shared_px:.2f} pixels together, and "
-    scale = float(_scale_errors(spread).max(initial=0.0))
-    if _SCALE_SHARE * scale > float(np.linalg.norm(spread.error_percent)):
-        first, last = spread.link_frames[int(np.argmax(_scale_errors(spread)))].tolist()
+    moved = _moved_by_scale(spread)
+    if moved.max(initial=0.0) > float(np.linalg.norm(spread.error_percent)):
+        first, last = spread.link_frames[int(np.argmax(moved))].tolist()
+        scale = float(_scale_errors(spread)[int(np.argmax(moved))])
         share = f"{100 * scale:.1g}" if scale < 0.01 else f"{100 * scale:.0f}"
         only = " only" if scale >= SAME_SCALE else ""
         return words + f"the scale between frames {first} and {last} is known to {share} %{only}"
