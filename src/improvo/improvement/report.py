@@ -182,7 +182,7 @@ def _verdict(
     start, how = validations[0], settings.validation
     words = rule(how)
     if best:
-        words += f" Kept: {candidates[best].name}; right matches against the start: "
+        words += f" Kept: {candidates[best].name}; against the start: "
         words += f"{gain_words(validations[best], start, how)}."
     elif len(candidates) > 1:
         words += " No round was better than the start: the weights kept are those at the start, unchanged."

@@ -100,6 +100,11 @@ class Gain:
         return self.after - self.before
 
     @property
+    def relative(self) -> float:
+        """The difference as a part of what was before; of one where nothing was."""
+        return self.difference / (self.before if self.before > 0 else 1.0)
+
+    @property
     def words(self) -> str:
         """In per cent of what it was before, with the interval."""
         value, interval = self._parts
@@ -120,7 +125,7 @@ class Gain:
 
 
 def loose(settings: SelfTruthSettings) -> str:
-    """The value that decides: the share of matches that are right within the wider limit."""
+    """One of the two values that decide: the share of matches that are right within the wider limit."""
     return f"right_{settings.right_px[1]:g}px"
 
 
@@ -130,7 +135,7 @@ def strict(settings: SelfTruthSettings) -> str:
 
 
 def found(settings: SelfTruthSettings) -> str:
-    """How many matches of a pair are right within the wider limit: a share also rises where wrong ones are lost."""
+    """The other: how many matches of a pair are right within it; a share also rises where wrong ones are lost."""
     return f"found_{settings.right_px[1]:g}px"
 
 
@@ -166,20 +171,20 @@ def gain(
 def rule(settings: ValidationSettings) -> str:
     """The decision rule, in a sentence."""
     return (
-        f"A frontend is better than the best one before it if a larger share of its matches is right within "
-        f"{settings.matches.right_px[1]:g} pixels on the frames held back, at all gaps together, and a larger one than "
-        f"at the start by more than chance (95 % interval); if the number of right ones is not less by more than "
-        f"chance; and if the odometry is not worse with it: it loses no more than {100 * settings.frames_lost:g} % of "
-        f"the frames that it tracked with the other, and breaks no more often. "
-        f"No recording of an earlier run may be worse by more than chance."
+        f"A frontend is better than the one at the start if, on the frames held back, more of its matches are right "
+        f"within {settings.matches.right_px[1]:g} pixels, or a larger share of them is, by more than chance (95 % "
+        f"interval, all gaps together), and if neither is less by more than chance; better than the best one before it "
+        f"if number and share together are larger and neither is less by more than chance; and if the odometry is not "
+        f"worse with it: it loses no more than {100 * settings.frames_lost:g} % of the frames that it tracked with the "
+        f"other, and breaks no more often. In no recording of an earlier run may the share be less by more than chance."
     )
 
 
 def is_better(candidate: Validation, best: Validation, start: Validation, settings: ValidationSettings) -> bool:
     """Whether a frontend is better than the best one before it; `rule` says it in words.
 
-    That it is better than the start must be more than chance. Between two that are, the one with the larger share is
-    the better guess, although their difference may be chance.
+    That it is better than the start must be more than chance. Between two that are, the one with the larger sum of
+    what number and share gained is the better guess, although the difference may be chance.
 
     Args:
         candidate: what was measured of it.
@@ -188,19 +193,22 @@ def is_better(candidate: Validation, best: Validation, start: Validation, settin
         settings: what its odometry may lose.
     """
     judge = settings.matches
-    larger = gain(candidate, best, loose(judge), judge).difference > 0
-    gained = gain(candidate, start, loose(judge), judge).low > 0
-    return larger and gained and all(_no_worse(candidate, before, settings) for before in (best, start))
+    over_best, over_start = (
+        [gain(candidate, before, name(judge), judge) for name in (loose, found)] for before in (best, start)
+    )
+    larger = sum(one.relative for one in over_best) > 0
+    gained = any(one.low > 0 for one in over_start)
+    no_less = all(one.high >= 0 for one in (*over_best, *over_start))
+    return larger and gained and no_less and all(_no_worse(candidate, before, settings) for before in (best, start))
 
 
 def _no_worse(candidate: Validation, before: Validation, settings: ValidationSettings) -> bool:
-    """Whether it loses nothing: no right matches, no frames, no recording of an earlier run."""
+    """Whether nothing else is lost: no frames of the odometry, no recording of an earlier run."""
     judge = settings.matches
     kept = candidate.tracked >= (1 - settings.frames_lost) * before.tracked
     whole = candidate.segments <= max(before.segments, 1) + settings.segments_more  # none where nothing was tracked
-    no_fewer = gain(candidate, before, found(judge), judge).high >= 0
     remembered = all(gain(candidate, before, loose(judge), judge, None, one).high >= 0 for one in before.earlier)
-    return kept and whole and no_fewer and remembered
+    return kept and whole and remembered
 
 
 def summary(validation: Validation, start: Validation, settings: ValidationSettings) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import textwrap
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,11 @@ from improvo.odometry.run_folder import RunFolder
 from improvo.report.overhead import overhead_axes, robust_limits
 from improvo.report.palettes import PALETTES, Palette
 from improvo.report.true_path import TruePath, true_path
-from improvo.types import SparseMap, UInt8
+from improvo.types import Float64, Int64, SparseMap, UInt8
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _BACKGROUND = "#565b63"  # neither the paper's black (last window) nor its white (points)
 _DOUBTED = "#ff4fd8"  # a band under the path, which no ramp of the palettes has
@@ -54,18 +59,15 @@ def map_png(
     """
     require_plots("a map seen from above")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-    trajectory = run.trajectory
-    if len(trajectory) == 0:
+    if len(run.trajectory) == 0:
         raise InputError(f"{run.path}: no frame has a pose, so there is no map to draw; see `events` in run.json")
-    axes_of_world = overhead_axes(trajectory.world_from_cam)
-    first = trajectory.camera_centers[0]  # where the axes begin
-    path_2d = axes_of_world.project(trajectory.camera_centers - first)
-    shown = trusted_points(run.map)
-    points_2d = axes_of_world.project(run.map.xyz[shown] - first)
-    low, high = robust_limits(path_2d, points_2d)
+    above = overhead_axes(run.trajectory.world_from_cam)
+    first = run.trajectory.camera_centers[0]  # where the axes begin
+    path = above.project(run.trajectory.camera_centers - first)
+    points = above.project(run.map.xyz[trusted_points(run.map)] - first)
+    low, high = robust_limits(path, points)
     width, height = _figure_size(high - low)
     if narrow:
         width, height = _NARROW, height * _NARROW / width + 0.6
@@ -73,67 +75,13 @@ def map_png(
     FigureCanvasAgg(figure)
     axis = figure.subplots()
     axis.set_facecolor(_BACKGROUND)
-    inside = ((points_2d > low) & (points_2d < high)).all(axis=1)
-    size, alpha = _point_style(int(inside.sum()))
-    size *= 0.4 if narrow else 1.0
-    axis.scatter(
-        points_2d[inside, 0],
-        points_2d[inside, 1],
-        s=size,
-        c=map_colours(run.map)[shown][inside] / 255.0,
-        alpha=alpha,
-        linewidths=0,
-        zorder=1,
-        rasterized=True,
-    )
-
-    links = np.stack([path_2d[:-1], path_2d[1:]], axis=1)
-    joined = trajectory.segment[:-1] == trajectory.segment[1:]
-    of_poses = palette.ramp_colours(run.frame_indices.astype(float), 0, max(run.frames - 1, 1)) / 255.0
-    colours = of_poses[1:]
-    axis.add_collection(
-        LineCollection(list(links[joined]), colors=colours[joined], linewidths=3.0, capstyle="round", zorder=3)
-    )
-    axis.add_collection(
-        LineCollection(list(links[~joined]), colors="white", linewidths=1.0, linestyles="dotted", zorder=2)
-    )
-    doubted = (run.doubtful | run.uncertain)[1:] & joined
-    axis.add_collection(
-        LineCollection(list(links[doubted]), colors=_DOUBTED, linewidths=8.0, capstyle="round", alpha=0.8, zorder=2)
-    )
-    last = path_2d[-last_poses:]
-    for number in np.unique(trajectory.segment[-last_poses:]):  # no black line leads from one to the next
-        here = last[trajectory.segment[-last_poses:] == number]
-        axis.plot(*here.T, color="white", linewidth=5.5, solid_capstyle="round", zorder=4)
-        axis.plot(*here.T, color="black", linewidth=3.5, solid_capstyle="round", zorder=5)
-    axis.plot(*path_2d[0], "o", color=tuple(of_poses[0]), markeredgecolor="white", markersize=8, zorder=6)
-    axis.annotate("start", path_2d[0], (6, 6), textcoords="offset points", color="white", fontsize=9, zorder=7)
-    for number in np.unique(trajectory.segment)[1:]:
-        start = path_2d[np.flatnonzero(trajectory.segment == number)[0]]
-        axis.annotate(
-            f"segment {number}", start, (6, -12), textcoords="offset points", color="white", fontsize=8, zorder=7
-        )
-
+    inside: NDArray[np.bool_] = np.all((points > low) & (points < high), axis=1)
+    _draw_points(axis, run, points, inside, narrow)
+    _draw_path(axis, run, path, palette, last_poses)
     truth = true_path(run)
     if truth is not None:
-        true_2d = axes_of_world.project(truth.drawn() - first)
-        for number in np.unique(trajectory.segment):
-            axis.plot(
-                *np.where((trajectory.segment == number)[:, None], true_2d, np.nan).T,
-                color="#7fffd4",
-                linewidth=1.3,
-                linestyle=(0, (4, 2)),
-                zorder=8,
-                label="true path, aligned" if number == trajectory.segment[0] else None,
-            )
-        is_below = float(np.median(path_2d[:, 1])) < (low[1] + high[1]) / 2  # where the path is, the legend is not
-        axis.legend(
-            loc="upper left" if is_below else "lower left",
-            fontsize=8,
-            facecolor=_BACKGROUND,
-            labelcolor="white",
-            framealpha=0.8,
-        )
+        is_below = float(np.median(path[:, 1])) < (low[1] + high[1]) / 2  # where the path is, the legend is not
+        _draw_truth(axis, run.trajectory.segment, above.project(truth.drawn() - first), is_below)
 
     axis.set_xlim(low[0], high[0])
     axis.set_ylim(low[1], high[1])
@@ -143,14 +91,79 @@ def map_png(
     unit = "metres" if run.unit.startswith("metres") else "map units: the first median depth is 1"
     axis.set_xlabel(f"right of the first camera ({unit})", fontsize=8)
     axis.set_ylabel("ahead of the first camera", fontsize=8)
-    title = _title(run, len(shown), int((~inside).sum()), truth)
+    title = _title(run, len(points), int((~inside).sum()), truth)
     if narrow:
         title = "\n".join(textwrap.fill(line, _NARROW_LINE) for line in title.splitlines())
     axis.set_title(title, fontsize=8 if narrow else 10)  # above the axis, however much of the figure that fills
-    _time_bar(figure, axis, palette, run.frames, len(last))
+    _time_bar(figure, axis, palette, run.frames, min(last_poses, len(path)))
     png = io.BytesIO()
     figure.savefig(png, dpi=220 if narrow else 150, format="png", bbox_inches="tight", metadata={"Software": None})
     return png.getvalue()
+
+
+def _draw_points(axis: Axes, run: RunFolder, points: Float64, inside: NDArray[np.bool_], narrow: bool) -> None:
+    """The trusted points of the map, (n, 2) seen from above, in their own colours; those inside of the picture."""
+    size, alpha = _point_style(int(inside.sum()))
+    axis.scatter(
+        points[inside, 0],
+        points[inside, 1],
+        s=size * (0.4 if narrow else 1.0),
+        c=map_colours(run.map)[trusted_points(run.map)][inside] / 255.0,
+        alpha=alpha,
+        linewidths=0,
+        zorder=1,
+        rasterized=True,
+    )
+
+
+def _draw_path(axis: Axes, run: RunFolder, path: Float64, palette: Palette, last_poses: int) -> None:
+    """The trajectory, (n, 2) seen from above: coloured by time, broken between segments, marked where it is doubted."""
+    from matplotlib.collections import LineCollection
+
+    segment = run.trajectory.segment
+    links = np.stack([path[:-1], path[1:]], axis=1)
+    joined = segment[:-1] == segment[1:]
+    doubted = (run.doubtful | run.uncertain)[1:] & joined
+    colours = palette.ramp_colours(run.frame_indices.astype(float), 0, max(run.frames - 1, 1)) / 255.0
+    looks: tuple[tuple[NDArray[np.bool_], dict[str, Any]], ...] = (
+        (joined, {"colors": colours[1:][joined], "linewidths": 3.0, "capstyle": "round", "zorder": 3}),
+        (~joined, {"colors": "white", "linewidths": 1.0, "linestyles": "dotted", "zorder": 2}),
+        (doubted, {"colors": _DOUBTED, "linewidths": 8.0, "capstyle": "round", "alpha": 0.8, "zorder": 2}),
+    )
+    for which, look in looks:
+        axis.add_collection(LineCollection(list(links[which]), **look))
+    last = path[-last_poses:]
+    for number in np.unique(segment[-last_poses:]):  # no black line leads from one to the next
+        here = last[segment[-last_poses:] == number]
+        axis.plot(*here.T, color="white", linewidth=5.5, solid_capstyle="round", zorder=4)
+        axis.plot(*here.T, color="black", linewidth=3.5, solid_capstyle="round", zorder=5)
+    axis.plot(*path[0], "o", color=tuple(colours[0]), markeredgecolor="white", markersize=8, zorder=6)
+    axis.annotate("start", path[0], (6, 6), textcoords="offset points", color="white", fontsize=9, zorder=7)
+    for number in np.unique(segment)[1:]:
+        start = path[np.flatnonzero(segment == number)[0]]
+        axis.annotate(
+            f"segment {number}", start, (6, -12), textcoords="offset points", color="white", fontsize=8, zorder=7
+        )
+
+
+def _draw_truth(axis: Axes, segment: Int64, truth: Float64, is_below: bool) -> None:
+    """The true path, (n, 2) seen from above; the legend is at the top where the path is below."""
+    for number in np.unique(segment):
+        axis.plot(
+            *np.where((segment == number)[:, None], truth, np.nan).T,
+            color="#7fffd4",
+            linewidth=1.3,
+            linestyle=(0, (4, 2)),
+            zorder=8,
+            label="true path, aligned" if number == segment[0] else None,
+        )
+    axis.legend(
+        loc="upper left" if is_below else "lower left",
+        fontsize=8,
+        facecolor=_BACKGROUND,
+        labelcolor="white",
+        framealpha=0.8,
+    )
 
 
 def trusted_points(sparse_map: SparseMap) -> NDArray[np.intp]:
@@ -195,13 +208,13 @@ def _point_style(count: int) -> tuple[float, float]:
     return float(np.clip(20_000 / max(count, 1), 1.2, 8.0)), float(np.clip(8_000 / max(count, 1), 0.35, 0.9))
 
 
-def _time_bar(figure: object, axis: object, palette: Palette, frames: int, last: int) -> None:
+def _time_bar(figure: Figure, axis: Axes, palette: Palette, frames: int, last: int) -> None:
     """The colour bar."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
 
     colours = ListedColormap(list(palette.ramp_table() / 255.0))
     scale = ScalarMappable(Normalize(0, max(frames - 1, 1)), colours)
-    bar = figure.colorbar(scale, ax=axis, fraction=0.035, pad=0.02)  # type: ignore[attr-defined]
+    bar = figure.colorbar(scale, ax=axis, fraction=0.035, pad=0.02)
     bar.set_label(f"frame (black: the last {last})", fontsize=8)
     bar.ax.tick_params(labelsize=8)
