@@ -38,8 +38,8 @@ def changed(**changes: Any) -> Verdict:
 def test_a_good_spread_is_right_and_says_what_the_estimate_rests_on() -> None:
     verdict = judge(GOOD, SETTINGS)
     assert verdict.word == RIGHT
-    assert verdict.error_percent == pytest.approx(1.25 * np.sqrt(6 * 0.3**2 + 2 * (5 * 8 * 0.01) ** 2))
-    assert verdict.evidence[0].startswith("estimated error 1.2 % of the path: ")
+    assert verdict.error_percent == pytest.approx(1.15 * np.sqrt(6 * 0.3**2 + (6 * 8 * 0.01) ** 2))
+    assert verdict.evidence[0].startswith("estimated error 1.0 % of the path: ")
 
 
 def test_each_kind_of_evidence_can_make_a_segment_doubtful() -> None:

@@ -14,8 +14,8 @@ from improvo.odometry.verdict.evidence import HALVES, PARTS, QUARTERS, Spread
 from improvo.odometry.verdict.seen_again import SeenAgain
 from improvo.types import Float64
 
-_SCALE_FACTOR = 5.0  # times what the parts disagree about the scale by (calibrated: docs/robustness-odometry.md)
-_COVERAGE = 1.25  # times the spread, for what all parts are off by together (calibrated in the same place)
+_SCALE_FACTOR = 6.0  # times what the parts disagree about a scale by (calibrated: docs/odometry.md)
+_COVERAGE = 1.15  # times the spread, for what all parts are off by together (docs/robustness-odometry.md)
 _USUAL_NOISE = 0.0016  # share of the picture's width; the estimate grows with noise that is larger
 _USUAL_SHARED = 0.0007  # the same of what neighbours are off by together: up to 0.0006 by a camera known roughly
 _USUAL_VIEWS = 4.0  # keyframes that observe a point; more of them average the noise
@@ -141,18 +141,17 @@ def joined(first: Verdict, second: Verdict, scale_error: float, paths: tuple[flo
 def estimated_error(spread: Spread) -> float:
     """Error of the segment's positions after Sim3, % of its path.
 
-    The root sum of squares of what the paths of the parts differ by, and of what their disagreement about the scale
-    moves at each link. Of the two halves of the points the better one counts twice: the other can have too few by
-    chance. Unusual noise is worse than its spread: what does not fit is dropped, so what stays agrees with what is
-    wrong. So is what neighbours are off by together, which is no noise of keypoints at all: the map follows several
-    motions. Where a point is seen by more keyframes than usual, both are averaged over its views, as by the square root
-    of their number.
+    The root sum of squares of what the paths of the parts differ by, and of what the least certain change of scale
+    moves. Of the two halves of the points the better one counts twice: the other can have too few by chance. Unusual
+    noise is worse than its spread: what does not fit is dropped, so what stays agrees with what is wrong. So is what
+    neighbours are off by together, which is no noise of keypoints at all: the map follows several motions. Where a
+    point is seen by more keyframes than usual, both are averaged over its views, as by the square root of their number.
     """
     averaged = min(float(np.sqrt(_USUAL_VIEWS / max(spread.views_per_point, 1.0))), 1.0)
     noise = averaged * np.nan_to_num(spread.noise_px) / (_USUAL_NOISE * spread.width)
     shared = averaged * spread.shared_px / (_USUAL_SHARED * spread.width)
     quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
-    scale = float(np.linalg.norm(_moved_by_scale(spread)))
+    scale = float(_moved_by_scale(spread).max(initial=0.0))
     spreads = (quarters**2).sum() + len(HALVES) * halves.min() ** 2 + scale**2
     return float(_COVERAGE * max(noise, shared, 1.0) ** _NOISE_POWER * np.sqrt(spreads))
 
