@@ -27,6 +27,7 @@ _SIGMAS_OF_GROWTH = 8.0  # its change within a window, which a step ahead imitat
 _RARE = 0.01  # share of windows that say so in right recordings; one of the hundreds of a long one is no alarm
 _LARGEST_LENS_ERROR = 0.06  # of the logarithm of a focal length; a window that knows it less well says nothing of it
 _SUSPECTED = 0.75  # of the error that a segment may have, where something speaks against it that right ones show, too
+_NOT_KNOWN = 0.5  # of the logarithm of a scale: about half or double
 _AS_WELL = 1.8  # error of a camera that only turns, over the map's: 1.2 to 1.6 where it did, 9 to 24 where it moved
 _MOVED = 0.03  # of the picture's width; what moves less is explained by any camera
 RIGHT, DOUBTFUL, NOT_JUDGED = "right", "doubtful", "not judged"
@@ -235,6 +236,8 @@ def _in_words(spread: Spread, error: float) -> str:
     if moved.max(initial=0.0) > float(np.linalg.norm(spread.error_percent)):
         first, last = spread.link_frames[int(np.argmax(moved))].tolist()
         scale = float(_scale_errors(spread)[int(np.argmax(moved))])
+        if scale >= _NOT_KNOWN:
+            return words + f"nothing tells the scale between frames {first} and {last}"
         share = f"{100 * scale:.1g}" if scale < 0.01 else f"{100 * scale:.0f}"
         only = " only" if scale >= SAME_SCALE else ""
         return words + f"the scale between frames {first} and {last} is known to {share} %{only}"
