@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from simulated_features import CAMERA, hand_motion, room
@@ -88,6 +90,7 @@ def test_without_a_leap_most_is_seen_again() -> None:
     gap = seen_again(keyframes[0], keyframes[1], room().points, CAMERA)
     assert gap.frames == (3, 4)
     assert gap.share > 0.8
+    assert 0.5 < gap.parallax_deg < 3.0
 
 
 def _of(i: int) -> tuple[Float64, np.ndarray]:
@@ -117,6 +120,8 @@ def test_a_gap_is_compared_with_what_is_usual_and_a_few_gaps_tell_nothing() -> N
     assert leaps([*noisy, found]) == (found,)
     assert leaps([*noisy, SeenAgain((10, 11), 20, 0)]) == ()  # hardly anything was expected
     assert leaps([*noisy[:4], found]) == ()
+    photographs = [replace(gap, parallax_deg=11.0) for gap in (*noisy, found)]
+    assert leaps(photographs) == ()
 
 
 @pytest.mark.parametrize("place", [10, 50, 80])
@@ -124,13 +129,16 @@ def test_a_change_of_scale_along_a_line_does_what_a_fitted_line_leaves(place: in
     """What is left of a hinge at the share p of a line, after the best line, is the root of (p (1 - p))^3 / 3."""
     line = np.linspace(0.0, 1.0, 101)[:, None] * (2.0, 1.0, 0.0)
     p = place / 100.0
-    assert scale_leverage(line, [place])[0] == pytest.approx(100.0 * np.sqrt((p * (1 - p)) ** 3 / 3.0), rel=0.06)
+    assert scale_leverage(line, [(place, place)])[0] == pytest.approx(
+        100.0 * np.sqrt((p * (1 - p)) ** 3 / 3.0), rel=0.06
+    )
 
 
 def test_a_change_of_scale_at_the_ends_or_of_a_path_that_stands_still_does_nothing() -> None:
     path = se3.inverse(TRUTH)[:, :3, 3]
-    assert scale_leverage(path, [0, KEYFRAMES - 1]) == pytest.approx([0.0, 0.0], abs=1e-6)
-    assert scale_leverage(np.zeros((5, 3)), [2]).tolist() == [0.0]
+    assert scale_leverage(path, [(0, 0), (KEYFRAMES - 1, KEYFRAMES - 1)]) == pytest.approx([0.0, 0.0], abs=1e-6)
+    assert scale_leverage(np.zeros((5, 3)), [(2, 2)]).tolist() == [0.0]
     assert scale_leverage(path, []).shape == (0,)
     long = np.repeat(path, 40, axis=0)  # of a long path only some places are looked at
-    assert scale_leverage(long, [600]) == pytest.approx(scale_leverage(path, [15]), rel=0.1)
+    assert scale_leverage(long, [(600, 600)]) == pytest.approx(scale_leverage(path, [(15, 15)]), rel=0.1)
+    assert scale_leverage(path, [(3, 20)]) == max(scale_leverage(path, [(i, i)]) for i in range(3, 21))

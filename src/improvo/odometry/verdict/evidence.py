@@ -115,7 +115,7 @@ class EvidenceCheck:
         self._is_seen = np.zeros(0, np.bool_)  # by map point
         self._scale_steps: list[Float64] = []
         self._links: list[tuple[int, int]] = []
-        self._places: list[int] = []  # of each link: the keyframe behind which the scale may be another
+        self._places: list[tuple[int, int]] = []  # of each link: the scale may be another behind one of these keyframes
         self._seen_again: list[SeenAgain] = []
         self._lens: list[LensMeasure] = []
         self._lens_due = True  # every other window: those between them share half of their keyframes with each
@@ -185,7 +185,7 @@ class EvidenceCheck:
         for gap in sorted(places):
             self._scale_steps.append(np.full(len(PARTS), _UNKNOWN_SCALE))
             self._links.append((self._frames[gap], self._frames[gap + 1]))
-            self._places.append(gap)
+            self._places.append((gap, gap))
         return found
 
     def _solve_window(self, xyz: Float64) -> None:
@@ -209,7 +209,9 @@ class EvidenceCheck:
         if self._overlap or thin:
             self._scale_steps.append(steps)
             self._links.append(frames)
-            self._places.append(before + (int(across.argmin()) if thin else (self._overlap + len(keyframes)) // 2 - 1))
+            thinnest = before + int(across.argmin())
+            newest = before + max(self._overlap - 1, 0), before + len(keyframes) - 2
+            self._places.append((thinnest, thinnest) if thin else newest)
         if self._lens_due and len(keyframes) >= _FEW:
             self._lens.append(measured_lens(window, frames, self._camera))
         if self._lens_due and self._camera_is_guess:

@@ -42,21 +42,23 @@ def path_length(positions: Float64) -> float:
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 
-def scale_leverage(path: Float64, places: Sequence[int]) -> Float64:
+def scale_leverage(path: Float64, places: Sequence[tuple[int, int]]) -> Float64:
     """What a change of scale at some place of a path does to it.
 
     Near its ends it moves little, and most in the middle: about 7 % of a straight path, more of one that winds.
 
     Args:
         path: (N, 3) positions.
-        places: L indices of positions, behind each of which all is larger by a factor.
+        places: first and last index of L stretches of it, behind one position of which all is larger by a factor; the
+            one that moves most counts.
 
     Returns:
         (L,) error after Sim3, in % of the path, per unit of the logarithm of that factor; 0 where it stands still.
     """
     length = path_length(path)
     every = np.unique(np.linspace(0, len(path) - 1, min(len(path), _PLACES)).astype(np.int64))
-    return np.array([_bent(path, int(place), every, length) for place in places]).reshape(-1)
+    moved = {place: _bent(path, place, every, length) for first, last in places for place in range(first, last + 1)}
+    return np.array([max(moved[place] for place in range(first, last + 1)) for first, last in places]).reshape(-1)
 
 
 def _bent(path: Float64, place: int, every: Int64, length: float) -> float:

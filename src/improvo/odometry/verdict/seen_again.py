@@ -6,7 +6,8 @@ evidence make. But a pose also says what else must be in the picture. At the rig
 successive keyframes sees, and that lie in the picture of the other, are seen by the other, too; at a wrong one only
 those that it was chosen by. How many that are depends on the frontend, on noise and on what stands in between, so each
 gap is compared with the other gaps of its segment. A single keyframe that sees little, blurred or in a flash, is no
-leap: those before and after it see the same again.
+leap: those before and after it see the same again. Photographs that are taken from far apart tell nothing: from another
+side, things look otherwise and hide others.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from improvo.types import Float64
 _MARGIN = 0.03  # of the picture's width: nearer to its border, frontends find no keypoints
 _FEWEST_EXPECTED = 2 * FEWEST  # by both keyframes together
 _FEW_GAPS = 6  # fewer tell nothing of what is usual
+_FAR_APART_DEG = 5.0  # usual parallax between keyframes: 1 to 3 in videos, 11 in photographs around a thing
 
 
 @dataclass(frozen=True)
@@ -36,11 +38,13 @@ class SeenAgain:
         frames: of the two successive ones.
         expected: observations of either that lie in the picture of the other.
         found: of these, those whose point the other observes.
+        parallax_deg: angle between the rays from both to what is expected, median.
     """
 
     frames: tuple[int, int]
     expected: int
     found: int
+    parallax_deg: float = 0.0
 
     @property
     def share(self) -> float:
@@ -63,11 +67,16 @@ def seen_again(before: EvidenceKeyframe, after: EvidenceKeyframe, xyz: Float64, 
         camera: pinhole, of both.
     """
     expected = found = 0
+    parallax = [np.zeros(0)]
+    centers = [se3.inverse(keyframe.cam_from_world)[:3, 3] for keyframe in (before, after)]
     for seer, other in ((before, after), (after, before)):
         points = seer.points[_inside(se3.transform(other.cam_from_world, xyz[seer.points]), camera)]
         expected += len(points)
         found += int(np.isin(points, other.points).sum())
-    return SeenAgain((before.frame_index, after.frame_index), expected, found)
+        parallax.append(_angle_deg(xyz[points] - centers[0], xyz[points] - centers[1]))
+    angles = np.concatenate(parallax)
+    median = float(np.median(angles)) if len(angles) else 0.0
+    return SeenAgain((before.frame_index, after.frame_index), expected, found, median)
 
 
 def looked_again(gaps: list[SeenAgain], keyframes: Sequence[EvidenceKeyframe], xyz: Float64, camera: Camera) -> None:
@@ -94,7 +103,7 @@ def leaps(gaps: Sequence[SeenAgain]) -> tuple[SeenAgain, ...]:
         gaps: of a segment, those between all successive keyframes.
     """
     telling = [gap for gap in gaps if gap.expected >= _FEWEST_EXPECTED]
-    if len(telling) < _FEW_GAPS:
+    if len(telling) < _FEW_GAPS or np.median([gap.parallax_deg for gap in telling]) > _FAR_APART_DEG:
         return ()
     usual = float(np.median([gap.share for gap in telling]))
     return tuple(gap for gap in telling if gap.share < LARGE_PART * usual)
@@ -107,3 +116,9 @@ def _inside(in_camera: Float64, camera: Camera) -> Mask:
     margin = _MARGIN * camera.width
     size = np.array([camera.width, camera.height])
     return np.asarray(front & (pixels > margin).all(axis=1) & (pixels < size - margin).all(axis=1))
+
+
+def _angle_deg(a: Float64, b: Float64) -> Float64:
+    """(N,) between vectors (N, 3) and (N, 3)."""
+    sizes = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+    return np.degrees(np.arccos(np.clip((a * b).sum(axis=1) / np.maximum(sizes, 1e-300), -1.0, 1.0)))
