@@ -32,7 +32,8 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from improvo.evaluation.measures import PairGeometry, relative_motion, right_matches
-from improvo.evaluation.pose.self_truth import FixedRun, choose_pairs, overlapping
+from improvo.evaluation.pose.pairs import overlapping
+from improvo.evaluation.pose.self_truth import FixedRun, choose_pairs
 from improvo.evaluation.statistics import Bootstrap
 from improvo.files import content_hash
 from improvo.frontend.registry import load_frontend

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import pkgutil
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,6 +66,25 @@ def test_every_public_name_resolves_and_is_listed() -> None:
     assert set(improvo._PUBLIC) == set(improvo.__all__) - {"__version__"}
     with pytest.raises(AttributeError, match="no attribute 'runn'"):
         improvo.runn  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_the_reference_has_every_public_name() -> None:
+    text = (ROOT / "docs" / "reference.md").read_text()
+    whole = set(re.findall(r"^::: (improvo[\w.]+)$", text, flags=re.MULTILINE))
+    listed = {
+        f"{module}.{member}"
+        for module, members in re.findall(
+            r"^::: (improvo[\w.]+)\n    options:\n      members: \[([^\]]+)\]", text, re.M
+        )
+        for member in members.split(", ")
+    }
+    whole -= {name.rpartition(".")[0] for name in listed}
+    for name in whole | listed:
+        pkgutil.resolve_name(name)  # it is there
+    for name, place in improvo._PUBLIC.items():
+        found: Any = getattr(improvo, name)
+        module, own = found.__module__, found.__name__
+        assert {module, f"{module}.{own}"} & (whole | listed), f"{name} ({place}): is not in docs/reference.md"
 
 
 def test_import_is_light() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,8 @@ def write_frames(folder: Path, pictures: list[Any], camera: Path) -> Path:
 def test_improve_says_what_it_did_and_where_the_result_is(
     walk: Path, training: FakeTraining, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "out"
+    out, still = tmp_path / "out", walk.parent / "still"
+    write_frames(still, [cv2.imread(str(walk / "000000.png"))] * 2, walk)
     words = ["improve", str(walk), "-o", str(out), "--steps", "90", "--seed", "7", *OPTIONS]
     assert main(words) == 0
     text = capsys.readouterr().out
@@ -68,11 +70,34 @@ def test_improve_says_what_it_did_and_where_the_result_is(
     assert f"weights in {out / 'weights.safetensors'}" in text
     assert (out / "report.html").is_file()
     assert [call["seed"] for call in training.calls] == [7]
+    assert main([*words, "--json"]) == 0  # from what is there
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["weights"] == str(out / "weights.safetensors")
+    assert figures["kept"] in ("start", "round-1")
     settings = yaml.safe_load((out / "settings.yaml").read_text())
     for recipe in ("held", "training"):
         assert settings[recipe]["optimiser"]["steps"] == 90
         assert settings[recipe]["optimiser"]["decay_steps"] == 30
     assert settings["odometry"]["seed"] == 7
+    begun = f"improvo: {out}: was begun "
+    mend = "; give the same again, or another output folder"
+
+    def differs(*words: object) -> str:
+        message = refused(capsys, walk, *words, "-o", out)
+        assert message.startswith(begun)
+        assert message.endswith(mend)
+        return message.removeprefix(begun).removesuffix(mend)
+
+    assert differs("--steps", 91, "--seed", 7) == "with --steps 90, now with --steps 91"
+    assert differs("--seed", 7) == "with --steps 90, now without --steps"
+    assert differs("--steps", 90) == "with --seed 7, now with --seed 0"
+    assert differs("--steps", 90, "--seed", 7, "--stride", 2) == "with --stride 1, now with --stride 2"
+    assert differs("--steps", 90, "--seed", 7, "--fov", 60) == "without --fov, now with --fov 60.0"
+    assert differs("--steps", 90, "--seed", 7, "--evaluate", still) == f"without --evaluate {still}"
+    assert differs(still, "--steps", 90, "--seed", 7) == f"without the recording {still}"
+    assert differs("--steps", 90, "--seed", 7, "--frontend", out / "weights.safetensors") == "with another --frontend"
+    message = differs("--steps", 90, "--seed", 7, "--set", "held.scale=20")
+    assert message == "with held.scale=28.0, now 20.0"
     assert main(["run", str(walk), "-o", str(tmp_path / "run"), "--frontend", str(out / "weights.safetensors")]) in (
         0,
         3,

@@ -49,6 +49,22 @@ def test_another_setting_is_refused_and_named_with_the_mend(record: SettingsReco
         record.check({"optimiser": SETTINGS["optimiser"]}, "")
 
 
+def test_of_a_list_of_words_it_is_told_what_is_missing_or_new(tmp_path: Path) -> None:
+    record = SettingsRecord(tmp_path / "settings.yaml")
+    long = [f"/videos/of/a/long/name/{i:04d}.mp4" for i in range(5)]
+    record.write({"sequences": long, "gaps": [1, 2]})
+    for now, words in (
+        (long[:-1], f"with sequences {long[-1]}; mend"),
+        ([*long, "/b.mp4"], "without sequences /b.mp4; mend"),
+        (long[::-1], "with sequences in another order; mend"),
+    ):
+        with pytest.raises(ConfigError) as raised:
+            record.check({"sequences": now, "gaps": [1, 2]}, "mend")
+        assert str(raised.value) == f"{tmp_path}: was begun {words}"
+    with pytest.raises(ConfigError, match=r"was begun with gaps=\[1, 2\], now \[1, 3\]; mend"):
+        record.check({"sequences": long, "gaps": [1, 3]}, "mend")
+
+
 def test_free_settings_may_differ(record: SettingsRecord) -> None:
     record.check({**SETTINGS, "optimiser": {"seed": 0, "threads": 8}}, "")
     record.check({**SETTINGS, "optimiser": {"seed": 0}}, "")

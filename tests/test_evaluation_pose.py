@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -17,7 +18,7 @@ from improvo.cli.main import main
 from improvo.errors import ConfigError, InputError
 from improvo.evaluation.measures import PairGeometry, PoseError, repeated_keypoints, right_matches
 from improvo.evaluation.pose.estimators import with_opencv, with_poselib
-from improvo.evaluation.pose.pairs import draw_pairs, pairs_of_sequence
+from improvo.evaluation.pose.pairs import draw_pairs, overlapping, pairs_of_sequence
 from improvo.evaluation.pose.results import results
 from improvo.evaluation.pose.run import run_pose_protocol
 from improvo.evaluation.pose.tables import pose_tables
@@ -468,3 +469,32 @@ def test_keyframes_get_gaps_by_overlap_unless_they_are_given(capsys) -> None:
     assert re.search(r"overlaps 0.8 0.6 0.45 are \d+( \d+)* frames", shown)
     assert main([*words, "--stride", "5", "--gaps", "3"]) == 0
     assert "overlap" not in capsys.readouterr().out
+
+
+def test_intervals_are_over_blocks_of_pairs_that_look_at_the_same_frames(tmp_path: Path) -> None:
+    outcome = run(tmp_path, PlaneFeatures(noise=1.5), pairs=30, gaps=(6,), estimators=("poselib",), resamples=200)
+    [row] = results(outcome)["rows"]
+    precision = outcome.records["right"] / outcome.records["judged"]
+    settings, pairs = outcome.settings, outcome.sequences[0].pairs[6]
+    assert overlapping(pairs) > 1
+    expected, single = (
+        Bootstrap(len(pairs), settings.seed, 200, block=block).interval(precision) for block in (overlapping(pairs), 1)
+    )
+    assert row["precision_interval"] == list(expected) != list(single)
+
+
+def test_an_earlier_result_is_of_the_depth_that_it_was_measured_with(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    room = tmp_path / "room"
+    shutil.copytree(bundled_sequence(), room)
+    words = ["evaluate", "pose", str(room), "--gaps", "5", "--pairs", "4", "--frontend", "orb", "--workers", "1"]
+    words += ["--max-frames", "30", "-o", str(tmp_path / "out")]
+    printed = []
+    for factor in (1, 1, 2):
+        for path in (room / "depth").iterdir():
+            if factor != 1:
+                cv2.imwrite(str(path), factor * cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+        assert main(words) == 0
+        printed.append(capsys.readouterr().out)
+    assert printed[0] == printed[1] != printed[2]

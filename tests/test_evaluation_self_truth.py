@@ -10,6 +10,7 @@ import pytest
 
 from evaluation_scene import CAMERA, PlaneFeatures, PlaneSequence
 from improvo.errors import ConfigError, InputError
+from improvo.evaluation.pose.pairs import overlapping
 from improvo.evaluation.pose.self_truth import (
     FixedRun,
     PairScores,
@@ -17,7 +18,6 @@ from improvo.evaluation.pose.self_truth import (
     choose_pairs,
     compare,
     compare_gaps,
-    overlapping,
     score_pairs,
 )
 from improvo.types import Float32

@@ -96,6 +96,13 @@ def test_what_does_not_fit_on_the_disk_is_refused_before_any_work(
     assert not (tmp_path / "truth.work" / "images").exists()
 
 
+def test_json_is_all_that_is_printed(walk: Path, made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["truth", str(walk), "-o", str(made), "--workers", "1", "--max-features", "700", "--json"]
+    assert main(words) == 0  # from what the first call left
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["registered"] == figures["frames"] == FRAMES
+
+
 def test_poses_and_camera_are_those_that_were_rendered(made: Path) -> None:
     found = read_reference(made)
     exact = motion()

@@ -72,6 +72,18 @@ def test_hloc_reads_its_keypoints_descriptors_and_matches(walk: Path, tmp_path: 
     assert len(list((tmp_path / "out" / "images").iterdir())) == FRAMES
 
 
+def test_another_layout_leaves_no_files_of_the_one_before(walk: Path, tmp_path: Path) -> None:
+    pytest.importorskip("h5py", reason="needs h5py: pip install 'improvo[hdf5]'")
+    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'improvo[truth]'")
+    files = {"hloc": {"features.h5", "matches.h5", "pairs.txt", "intrinsics.txt"}, "colmap": {"database.db"}}
+    for layout in ("hloc", "colmap", "hloc"):
+        export(walk, tmp_path / "out", layout, "--max-frames", "4")
+        found = {path.name for path in (tmp_path / "out").iterdir() if path.is_file() and path.name[0] != "."}
+        assert files[layout] <= found
+        assert not found & set.union(*(names for other, names in files.items() if other != layout))
+        assert len(list((tmp_path / "out" / "images").iterdir())) == 4
+
+
 def test_a_frame_that_is_left_out_is_said(walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("h5py", reason="needs h5py: pip install 'improvo[hdf5]'")
     damaged = Path(shutil.copytree(walk, tmp_path / "walk"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -353,3 +354,40 @@ def test_opencv_loads_the_exported_onnx_as_a_feature2d(tmp_path, size):
     np.testing.assert_allclose(descriptors[theirs], expected.descriptors[ours], atol=1e-4)
     scores = np.array([keypoint.response for keypoint in found])
     np.testing.assert_allclose(scores[theirs], expected.scores[ours], atol=1e-4)
+
+
+TURKISH = """
+import locale
+import sys
+
+import numpy as np
+
+import improvo
+
+if len(sys.argv) > 1:
+    assert locale.setlocale(locale.LC_ALL, "tr_TR.UTF-8")
+picture = np.random.default_rng(0).integers(0, 255, (64, 72)).astype(np.uint8)
+for precision in ("float32", "int8"):
+    options = improvo.NetworkOptions(runtime="openvino", precision=precision, threads=1)
+    print(improvo.load_frontend("superpoint-small", 50, network=options)(picture).keypoints.tolist())
+if len(sys.argv) > 1:
+    print(locale.setlocale(locale.LC_ALL), file=sys.stderr)
+"""
+
+
+@pytest.mark.skipif(shutil.which("localedef") is None, reason="needs localedef, of the C library's own tools")
+def test_a_turkish_user_gets_the_same_keypoints(tmp_path: Path) -> None:
+    """In Turkish `i` is not the small letter of `I`, which OpenVINO trips over in the names of its options."""
+    made = subprocess.run(
+        ["localedef", "-i", "tr_TR", "-f", "UTF-8", str(tmp_path / "tr_TR.UTF-8")], capture_output=True
+    )
+    if made.returncode > 1 or not (tmp_path / "tr_TR.UTF-8").exists():
+        pytest.skip("needs the sources of the C library's locales")
+    environment = {**os.environ, "LOCPATH": str(tmp_path), "LC_ALL": "tr_TR.UTF-8"}
+    turkish = subprocess.run(
+        [sys.executable, "-c", TURKISH, "all"], capture_output=True, text=True, env=environment, check=True
+    )
+    plain = subprocess.run([sys.executable, "-c", TURKISH], capture_output=True, text=True, check=True)
+    assert turkish.stdout == plain.stdout
+    assert len(plain.stdout.splitlines()) == 2
+    assert turkish.stderr.strip().endswith("tr_TR.UTF-8")  # the user's own again

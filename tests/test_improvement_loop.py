@@ -504,7 +504,7 @@ def test_a_growing_set_starts_from_the_last_weights_and_replays_what_it_had(
     assert {scores.recording for scores in result.validations[0].own} == {"hall"}
     earlier = [scores for scores in result.validations[0].scores if scores.earlier]
     assert [scores.pairs for scores in earlier] == [scores.pairs for scores in finished[0].validations[0].scores]
-    assert any(line.startswith("round 1: ") and f"; {name} " in line for line in lines)
+    assert any(line.startswith("round 1: ") and f"; {name}, share: " in line for line in lines)
     for output, sequences, match in (
         (tmp_path / "same", [walk], "add new ones"),
         (before, [walk, hall], "cannot follow itself"),

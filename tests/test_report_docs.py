@@ -41,7 +41,8 @@ def exists(name: str) -> bool:
     parts = name.split(".")
     for length in range(len(parts), 0, -1):
         base = ROOT / "src" / Path(*parts[:length])
-        file = base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
+        module = base.with_suffix(".py")
+        file = module if module.is_file() else base / "__init__.py"
         if file.is_file():
             return defines(ast.parse(file.read_text()).body, parts[length:]) or (
                 length == 1 and f'"{parts[1]}"' in file.read_text()  # the short names of the package itself

@@ -15,7 +15,7 @@ from rendered_walk import write_walk
 import sequence_encoders as encoders
 from fuzz_targets import scene
 from improvo.sequences import open_recording, open_sequence
-from improvo.sequences.content import content_of
+from improvo.sequences.content import content_of, depth_content
 from sequence_builders import images, write_video
 
 FRAMES = 8
@@ -130,3 +130,19 @@ def test_what_is_in_a_recording_is_told_wherever_it_lies(tmp_path: Path) -> None
         writer.release()
         videos.append(content(tmp_path / name))
     assert videos[0] == videos[1] != videos[2]
+
+
+def test_depth_is_told_beside_the_pictures(tmp_path: Path) -> None:
+    encoders.write_tum(tmp_path / "room", scene(FRAMES))
+    shutil.copytree(tmp_path / "room", tmp_path / "copy")
+    before, same = (open_recording(tmp_path / name) for name in ("room", "copy"))
+    assert depth_content(before) == depth_content(same)
+    edited = sorted((tmp_path / "copy" / "depth").iterdir())[5]
+    cv2.imwrite(str(edited), cv2.imread(str(edited), cv2.IMREAD_UNCHANGED) + 1)
+    after = open_recording(tmp_path / "copy")
+    told = [depth_content(before), depth_content(after)]
+    assert content_of(after) == content_of(before)  # labels and features do not depend on it
+    edited.unlink()
+    assert len({*told, depth_content(after)}) == 3
+    encoders.write_image_folder(tmp_path / "without", scene(FRAMES))
+    assert depth_content(open_recording(tmp_path / "without"))

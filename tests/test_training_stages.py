@@ -248,7 +248,10 @@ def test_the_commands_go_from_shapes_to_a_second_round(
     tmp_path: Path, photographs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (photographs / "broken.png").write_bytes(b"no picture")
-    assert main(["train", "shapes", "-o", str(tmp_path / "shapes"), *QUICK]) == 0
+    assert main(["train", "shapes", "-o", str(tmp_path / "shapes"), *QUICK, "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["weights"] == str(tmp_path / "shapes" / "weights.safetensors")
+    assert np.isfinite(figures["loss"])
     few = [*QUICK, "--set", "adaptation.views=6", "--set", "shapes=9"]
     first = ["train", "homographies", str(photographs), "-o", str(tmp_path / "first"), *few]
     assert main([*first, "--from", str(tmp_path / "shapes" / "weights.safetensors")]) == 0

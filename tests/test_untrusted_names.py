@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from contextlib import suppress
 from pathlib import Path
 
@@ -10,10 +11,16 @@ import cv2
 import numpy as np
 import pytest
 
+from fuzz_targets import scene
 from improvo import config
 from improvo.cli.main import main
+from improvo.cli.train_options import read_data_card
 from improvo.continuation import SettingsRecord
 from improvo.errors import ConfigError, ImprovoError, InputError, OutputError
+from improvo.evaluation.homography.pairs import Scene, open_scene
+from improvo.evaluation.settings import HomographySettings
+from improvo.evaluation.stability.causes import TrueCauses
+from improvo.evaluation.truth.colmap_model import read_colmap_model
 from improvo.evaluation.truth.reference import lacks_times
 from improvo.files import check_output_folder, write_text
 from improvo.geometry.camera_files import calibration_yaml, load_calibration
@@ -29,6 +36,7 @@ from improvo.sequences.opening import FORMATS
 from improvo.stability.tables import read_points
 from improvo.untrusted.text import load_json, load_yaml, read_json_file
 from sequence_builders import CAMERA, images, write_images
+from sequence_encoders import write_r3d
 
 DIGITS = "9" * 5000
 
@@ -180,7 +188,11 @@ def test_a_text_that_calls_itself_a_video(tmp_path: Path, script: str, suffix: s
 def test_a_pipe_or_a_device_is_never_read(special: str, tmp_path: Path) -> None:
     """It may lie in a folder of a stranger; to open one without a writer waits forever."""
     os.mkfifo(tmp_path / "pipe")
-    for name in ("a.png", "a.txt", "a.json", "a.yaml", "a.parquet", "run.json"):
+    (tmp_path / "images.bin").write_bytes(bytes(8))
+    picture = str(tmp_path / "1.png")
+    cv2.imwrite(picture, np.zeros((64, 64), np.uint8))
+    names = ("a.png", "a.txt", "a.json", "a.yaml", "a.parquet", "run.json", "simulation.json", "cameras.bin", "H_1_2")
+    for name in names:
         (tmp_path / name).symlink_to(tmp_path / "pipe" if special == "pipe" else special)
     words = "is a pipe or a device, not a file"
     with pytest.raises(UnreadableFrameError, match=words):
@@ -194,6 +206,10 @@ def test_a_pipe_or_a_device_is_never_read(special: str, tmp_path: Path) -> None:
         lambda: read_points(tmp_path / "a.parquet"),
         lambda: RunFolder(tmp_path),
         lambda: lacks_times(tmp_path / "a.txt"),
+        lambda: TrueCauses(tmp_path),
+        lambda: read_colmap_model(tmp_path),
+        lambda: read_data_card(tmp_path / "a.json"),
+        lambda: open_scene(Scene("a", "other", picture, ((picture, str(tmp_path / "H_1_2")),)), HomographySettings()),
     ):
         with pytest.raises(ImprovoError, match=words):
             read()
@@ -210,3 +226,25 @@ def test_a_pipe_among_the_pictures_is_left_out_and_named(suffix: str, tmp_path: 
     sequence = open_sequence(tmp_path, fov=60.0)
     assert len(list(sequence)) == 5
     assert [(each.index, each.reason) for each in sequence.skipped] == [(3, "is a pipe or a device, not a file")]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs a POSIX system")
+def test_a_pipe_in_an_unpacked_phone_recording_is_left_out_and_named(tmp_path: Path) -> None:
+    write_r3d(tmp_path / "s.r3d", scene(6))
+    shutil.unpack_archive(tmp_path / "s.r3d", tmp_path / "s", "zip")
+    picture = sorted((tmp_path / "s" / "rgbd").glob("*.png"))[3]
+    picture.unlink()
+    picture.symlink_to(tmp_path / "pipe")
+    os.mkfifo(tmp_path / "pipe")
+    sequence = open_sequence(tmp_path / "s")
+    assert len(list(sequence)) == 5
+    assert [(each.index, each.reason) for each in sequence.skipped] == [(3, "is a pipe or a device, not a file")]
+
+
+def test_a_picture_too_narrow_for_a_field_of_view_is_named_as_that(tmp_path: Path) -> None:
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((4000, 3), 40 * number, np.uint8))
+    message = refused(lambda: open_sequence(tmp_path, fov=60.0))
+    assert "pictures of 3x4000 are too narrow for a field of view of 60 degrees across their width" in message
+    assert "millimetres" not in message
+    assert open_sequence(tmp_path, camera="500,500,1,2000").camera.fx == 500

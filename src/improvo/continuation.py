@@ -16,6 +16,43 @@ from improvo.untrusted.text import load_json, load_yaml
 _LONGEST_VALUE = 60  # characters of a value in a message
 
 
+class DifferentSettingsError(ConfigError):
+    """A folder of results was begun under other settings.
+
+    Args:
+        folder: of the results.
+        name: of the first setting that differs, with dots.
+        recorded: all settings that the folder was begun with, as nested dictionaries.
+        given: all of them now.
+        mend: what the user can do.
+    """
+
+    def __init__(self, folder: Path, name: str, recorded: Any, given: Any, mend: str) -> None:
+        self.folder, self.name, self.recorded, self.given, self.mend = folder, name, recorded, given, mend
+        super().__init__(self.message(self.list_words(name) or f"with {_values_words(name, recorded, given)}"))
+
+    def list_words(self, called: str) -> str:
+        """What a list of words lacks, or has more; empty where the setting is none. Two long ones look alike when cut.
+
+        Args:
+            called: what the message calls the list.
+        """
+        before, now = value_of(self.name, self.recorded), value_of(self.name, self.given)
+        if not (
+            isinstance(before, list) and isinstance(now, list) and all(isinstance(one, str) for one in before + now)
+        ):
+            return ""
+        for words, one, other in (("with", before, now), ("without", now, before)):
+            only = next((item for item in one if item not in other), None)
+            if only is not None:
+                return f"{words} {called} {only}"
+        return f"with {called} in another order"
+
+    def message(self, difference: str) -> str:
+        """The whole message, with other words for what differs."""
+        return f"{self.folder}: was begun {difference}; {self.mend}"
+
+
 class SettingsRecord:
     """A file that says what the results beside it depend on.
 
@@ -62,14 +99,8 @@ class SettingsRecord:
 
     def difference(self, settings: Any) -> str:
         """The first setting that differs from the record, in words; empty where none does or nothing is recorded."""
-        before = self.read()
-        if before is None:
-            return ""
-        if isinstance(before, dict) and isinstance(settings, dict):
-            before = config.over(self._defaults, before)
-        known = before.keys() if isinstance(before, dict) else ()
-        free = [name if entry in known else entry for name, entry in self._contents.items()]
-        return first_difference(self._fixed(before, free), self._fixed(settings, free))
+        before, now, _, _ = self._compared(settings)
+        return first_difference(before, now)
 
     def check(self, settings: Any, mend: str) -> None:
         """Refuse to go on under other settings.
@@ -79,12 +110,13 @@ class SettingsRecord:
             mend: what the user can do, at the end of the message.
 
         Raises:
-            ConfigError: a setting differs; the message names the first one.
+            DifferentSettingsError: a setting differs; the message names the first one.
             InputError: the record is damaged.
         """
-        difference = self.difference(settings)
-        if difference:
-            raise ConfigError(f"{self.path.parent}: was begun with {difference}; {mend}")
+        before, now, recorded, given = self._compared(settings)
+        name = first_different(before, now)
+        if name is not None:
+            raise DifferentSettingsError(self.path.parent, name, recorded, given, mend)
 
     def write(self, settings: Any) -> None:
         """Record the settings."""
@@ -94,6 +126,21 @@ class SettingsRecord:
             write_json(self.path, settings)
         else:
             write_text(self.path, yaml.safe_dump(settings, sort_keys=False))
+
+    def _compared(self, settings: Any) -> tuple[Any, Any, Any, Any]:
+        """What the record and the settings say of all that must not differ, then all that they say; alike if no record.
+
+        Raises:
+            InputError: the record is damaged.
+        """
+        before = self.read()
+        if before is None:
+            return settings, settings, settings, settings
+        if isinstance(before, dict) and isinstance(settings, dict):
+            before = config.over(self._defaults, before)
+        known = before.keys() if isinstance(before, dict) else ()
+        free = [name if entry in known else entry for name, entry in self._contents.items()]
+        return self._fixed(before, free), self._fixed(settings, free), before, settings
 
     def _fixed(self, settings: Any, free: Iterable[str]) -> Any:
         """A copy without the settings that may differ."""
@@ -108,23 +155,40 @@ class SettingsRecord:
         return fixed
 
 
-def first_difference(before: Any, now: Any, prefix: str = "") -> str:
+def first_difference(before: Any, now: Any) -> str:
     """The first setting that differs between two nested dictionaries, in words; empty where none does.
 
     Args:
         before: nested dictionaries, or a value.
         now: the same, later.
-        prefix: of the names of settings, with a dot at its end.
     """
+    name = first_different(before, now)
+    return "" if name is None else _values_words(name, before, now)
+
+
+def first_different(before: Any, now: Any) -> str | None:
+    """The name, with dots, of the first setting that differs between two nested dictionaries; None where none does."""
     if not (isinstance(before, dict) and isinstance(now, dict)):
-        return "" if before == now else f"{prefix.rstrip('.')}={_short(before)}, now {_short(now)}"
+        return None if before == now else ""
     for key in [*before, *(key for key in now if key not in before)]:
-        difference = first_difference(before.get(key), now.get(key), f"{prefix}{key}.")
-        if difference:
-            return difference
-    return ""
+        below = first_different(before.get(key), now.get(key))
+        if below is not None:
+            return f"{key}.{below}".rstrip(".")
+    return None
 
 
-def _short(value: Any) -> str:
+def value_of(name: str, settings: Any) -> Any:
+    """What nested dictionaries say of a setting; None where they do not have it."""
+    for part in name.split(".") if name else ():
+        settings = settings.get(part) if isinstance(settings, dict) else None
+    return settings
+
+
+def short(value: Any) -> str:
+    """A value for a message, cut where it is long."""
     text = str(value)
     return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}..."
+
+
+def _values_words(name: str, before: Any, now: Any) -> str:
+    return f"{name}={short(value_of(name, before))}, now {short(value_of(name, now))}"

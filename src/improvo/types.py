@@ -76,6 +76,9 @@ class Trajectory:
     """Camera poses over time; a row without a pose is NaN.
 
     Poses of one segment share a world frame and a scale; those of different segments do not.
+
+    Raises:
+        ValueError: another number of poses than of times, or poses that are not 4x4 matrices.
     """
 
     times: Float64  # (N,) seconds, increasing
@@ -83,6 +86,9 @@ class Trajectory:
     segment: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (N,) segment number, -1 without pose
 
     def __post_init__(self) -> None:
+        if np.shape(self.world_from_cam) != (len(self.times), 4, 4):
+            shape, wanted = np.shape(self.world_from_cam), (len(self.times), 4, 4)
+            raise ValueError(f"Trajectory.world_from_cam: shape {shape}, expected {wanted}, a matrix for each time")
         if len(self.segment) != len(self.times):
             object.__setattr__(self, "segment", np.where(self.valid, 0, -1).astype(np.int64))
 

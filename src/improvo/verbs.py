@@ -32,6 +32,11 @@ if TYPE_CHECKING:
 PathLike = str | Path
 
 
+def _each(paths: PathLike | Sequence[PathLike]) -> list[PathLike]:
+    """A list also of a single path, whose letters would else be taken for paths."""
+    return [paths] if isinstance(paths, str | Path) else list(paths)
+
+
 def run(
     sequence: ImageSequence | PathLike,
     output: PathLike,
@@ -86,7 +91,7 @@ def run(
 
 
 def label(
-    sequences: Sequence[PathLike],
+    sequences: PathLike | Sequence[PathLike],
     output: PathLike,
     settings: RunSettings | None = None,
     workers: int | None = None,
@@ -95,7 +100,7 @@ def label(
     """Stability labels for many sequences, as `improvo label` makes them; what is done already is not done again.
 
     Args:
-        sequences: paths of recordings.
+        sequences: paths of recordings, or one path.
         output: folder of the label store.
         settings: all numbers; by default those of `LabelRunSettings`.
         workers: sequences at a time, a process with one core for each; by default one, in this process, on all cores.
@@ -113,8 +118,9 @@ def label(
 
     chosen = settings or LabelRunSettings()
     folder = local_folder(output)
-    chosen = replace(chosen, sequence=_found(sequences, chosen.sequence, folder, "label"))
-    records = label_sequences([Path(path) for path in sequences], folder, chosen, workers, ray=ray)
+    recordings = [Path(path) for path in _each(sequences)]
+    chosen = replace(chosen, sequence=_found(recordings, chosen.sequence, folder, "label"))
+    records = label_sequences(recordings, folder, chosen, workers, ray=ray)
     publish(folder)
     return records
 
@@ -158,17 +164,17 @@ class Trained:
 
 
 def train_odometry(
-    labels: Sequence[PathLike],
+    labels: PathLike | Sequence[PathLike],
     output: PathLike,
     settings: OdometryTrainingSettings | None = None,
     start: PathLike = "superpoint",
-    pictures: Sequence[str] = (),
+    pictures: str | Sequence[str] = (),
     data: Sequence[DataSource] = (),
 ) -> Trained:
     """VO adaptation, as `improvo train odometry` does it (needs the extra `train`).
 
     Args:
-        labels: label stores, as `label` makes them.
+        labels: label stores, as `label` makes them, or one.
         output: folder for weights, metrics and checkpoints; an unfinished one is continued.
         settings: all numbers.
         start: weights to start from, a bundled name or a file.
@@ -187,13 +193,13 @@ def train_odometry(
 
     settings, folder = settings or OdometryTrainingSettings(), local_folder(output)
     metrics = stages.train_odometry(
-        [local_folder(path, writing=False) for path in labels],
+        [local_folder(path, writing=False) for path in _each(labels)],
         settings,
         folder,
         find_weights(start),
         tuple(data),
         False,
-        list(pictures),
+        [pictures] if isinstance(pictures, str) else list(pictures),
     )
     publish(folder)
     return Trained(folder / "weights.safetensors", metrics)
@@ -212,18 +218,18 @@ def need_torch() -> None:
 
 
 def improve(
-    sequences: Sequence[PathLike],
+    sequences: PathLike | Sequence[PathLike],
     output: PathLike,
     settings: ImproveSettings | None = None,
     rounds: int | None = None,
-    evaluate: Sequence[PathLike] = (),
+    evaluate: PathLike | Sequence[PathLike] = (),
     workers: int | None = None,
     after: PathLike | None = None,
 ) -> Improvement:
     """The loop: label, train, validate, and keep the better weights, as `improvo improve` does it.
 
     Args:
-        sequences: recordings without ground truth; part of them is held out.
+        sequences: recordings without ground truth, or one; part of them is held out.
         output: folder for weights, rounds and report; an unfinished one is continued.
         settings: all numbers.
         rounds: of training and validation; by default two, or one where that is not better or two take too long.
@@ -240,7 +246,7 @@ def improve(
     from improvo.improvement.improve import improve as run_rounds
     from improvo.improvement.settings import ImproveSettings
 
-    recordings, held_out = [Path(path) for path in sequences], [Path(path) for path in evaluate]
+    recordings, held_out = [Path(path) for path in _each(sequences)], [Path(path) for path in _each(evaluate)]
     folder = local_folder(output)
     settings = settings or ImproveSettings()
     settings = replace(settings, sequence=_found([*recordings, *held_out], settings.sequence, folder, "improve"))
@@ -265,8 +271,8 @@ class PoseAccuracy:
 
 
 def evaluate_pose(
-    sequences: Sequence[PathLike],
-    frontends: Sequence[str],
+    sequences: PathLike | Sequence[PathLike],
+    frontends: str | Sequence[str],
     settings: PoseSettings | None = None,
     sequence_settings: SequenceSettings | None = None,
     workers: int = 1,
@@ -274,7 +280,7 @@ def evaluate_pose(
     """3D-to-2D pose estimation (paper, Table 1), as `improvo evaluate pose` does it.
 
     Args:
-        sequences: recordings with depth and true poses.
+        sequences: recordings with depth and true poses, or one.
         frontends: bundled names, weights files or peers; all get the same pairs.
         settings: of the protocol.
         sequence_settings: how the recordings are read.
@@ -294,9 +300,12 @@ def evaluate_pose(
     from improvo.sequences import SequenceSettings
 
     settings = settings or PoseSettings()
-    sources = [Recorded(str(path), sequence_settings or SequenceSettings()) for path in sequences]
+    sources = [Recorded(str(path), sequence_settings or SequenceSettings()) for path in _each(sequences)]
     settings = with_gaps_in_frames(settings, [source.open() for source in sources])
-    loaded = [LoadedFrontend(name, settings.max_keypoints) for name in frontends]
+    loaded = [
+        LoadedFrontend(name, settings.max_keypoints)
+        for name in ([frontends] if isinstance(frontends, str) else frontends)
+    ]
     for frontend in loaded:
         frontend.check()
     with tempfile.TemporaryDirectory(prefix="improvo-") as cache, Workers(workers) as pool:
@@ -330,6 +339,7 @@ def evaluate_trajectory(
     Rows of a KITTI file without times are taken as the rows of the other, one by one.
 
     Raises:
+        TypeError: neither poses nor a path.
         InputError: a file that is no trajectory, a sequence without true poses, rows without times of which the
             other has another number, or no common time.
     """
@@ -342,8 +352,15 @@ def evaluate_trajectory(
     return errors_of(ours, true, settings or TrajectorySettings(), names)
 
 
-def _poses_or_path(given: Trajectory | PathLike) -> Trajectory | Path:
-    return Path(given) if isinstance(given, str | Path) else given
+def _poses_or_path(given: object) -> Trajectory | Path:
+    from improvo.types import Trajectory
+
+    if isinstance(given, Trajectory):
+        return given
+    if not isinstance(given, str | Path):
+        mend = "give a path or a `Trajectory`, such as `odometry.trajectory` or `sequence.ground_truth`"
+        raise TypeError(f"trajectory: is a {type(given).__name__}; {mend}")
+    return Path(given)
 
 
 def _name_of(given: Trajectory | PathLike, otherwise: str) -> str:

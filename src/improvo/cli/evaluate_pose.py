@@ -234,6 +234,7 @@ def _request(settings: PoseSettings, sources: list[Recorded], frontends: list[Fe
     """All that decides the result; an earlier result with the same request is printed again."""
     from improvo.config import to_dict
     from improvo.evaluation.sources import sequence_fingerprint
+    from improvo.sequences.content import depth_content
 
     sequences = [source.open() for source in sources]
     truths = {
@@ -247,6 +248,7 @@ def _request(settings: PoseSettings, sources: list[Recorded], frontends: list[Fe
             sequence_fingerprint(source, sequence) for source, sequence in zip(sources, sequences, strict=True)
         ],
         "truth": truths,
+        "depth": {sequence.name: depth_content(sequence.recording) for sequence in sequences},
         "frontends": [{"label": frontend.label, **frontend.fingerprint()} for frontend in frontends],
     }
 

@@ -22,7 +22,10 @@ from improvo.cli.options import (
 from improvo.cli.output import figures, next_step, say, typed
 from improvo.export.settings import FeatureExportSettings
 
-_LAYOUTS = ("hloc", "colmap")
+_FILES = {  # of each layout
+    "hloc": ("features.h5", "matches.h5", "pairs.txt", "intrinsics.txt"),
+    "colmap": ("database.db",),
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "sequence", type=recording_path, metavar="SEQUENCE", help="a video, an image folder, a data set, or `demo`"
     )
-    parser.add_argument("--layout", choices=_LAYOUTS, required=True, help="whose files to write")
+    parser.add_argument("--layout", choices=tuple(_FILES), required=True, help="whose files to write")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER", help="new folder for them")
     add_setting(parser, defaults, "--window", "window")
     add_setting(parser, defaults, "--loop-every", "loop_every")
@@ -72,6 +75,9 @@ def run(arguments: argparse.Namespace) -> int:
             written = write_hloc(frames, sequence.camera, folder, settings.descriptors)
         else:
             written = write_colmap_database(frames, sequence.camera, folder, settings.seed)
+        for other in set(_FILES) - {arguments.layout}:  # of an earlier export, maybe of another recording
+            for name in _FILES[other]:
+                (folder / name).unlink(missing_ok=True)
     figures(
         {"folder": str(folder), "layout": arguments.layout, **asdict(written)},
         f"{folder}: {written.images} images, {written.keypoints} keypoints, {written.pairs} "

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from improvo.cli import output
 from improvo.cli.auto_camera import with_found_camera
+from improvo.cli.begun_with import add_words, flag_words
 from improvo.cli.flags import add_setting
 from improvo.cli.label import add_job_arguments
 from improvo.cli.options import (
@@ -25,11 +27,15 @@ from improvo.cli.options import (
 from improvo.cli.output import figures, next_step, notice, say, typed
 from improvo.cli.plan import say_improve_plan
 from improvo.cli.train_options import add_data_card, read_data_card
+from improvo.continuation import value_of
 from improvo.errors import ConfigError
 from improvo.files import check_output_folder
 from improvo.frontend.registry import check_frontend
 from improvo.improvement.settings import METRIC, RECIPES, ImproveSettings
 from improvo.verbs import need_torch
+
+_SECTIONS = ("held", "training")  # settings of the recipes that train step by step
+_OF_BOTH = ("steps", "seed", "batch_size", "device", "threads")  # flags for the optimiser of either
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -91,19 +97,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_setting(group, defaults, "--threads", "held.optimiser.threads", metavar="N")
     add_sequence_arguments(parser)
     add_config_arguments(parser)
+    both = {f"{section}.optimiser.{name}": f"--{name.replace('_', '-')}" for section in _SECTIONS for name in _OF_BOTH}
+    add_words(parser, {setting: flag_words(setting, flag) for setting, flag in both.items()})
+    add_words(parser, {"steps_per_frame": _steps_words})
+
+
+def _steps_words(settings: Any) -> str:
+    """`--steps` leaves none of the steps to the number of frames."""
+    steps = value_of("held.optimiser.steps", settings)
+    return "without --steps" if value_of("steps_per_frame", settings) else f"with --steps {steps}"
 
 
 def _of_both_recipes(arguments: argparse.Namespace) -> list[str]:
     """Settings of the optimiser that a flag gives to either recipe."""
     extra = []
-    for name in ("steps", "seed", "batch_size", "device", "threads"):
+    for name in _OF_BOTH:
         if hasattr(arguments, name):
-            extra += [f"{recipe}.optimiser.{name}={getattr(arguments, name)}" for recipe in ("held", "training")]
+            extra += [f"{section}.optimiser.{name}={getattr(arguments, name)}" for section in _SECTIONS]
     if hasattr(arguments, "steps"):
         if getattr(arguments, "recipe", "") == METRIC:
             raise ConfigError("--steps: the recipe `metric` makes none; --set metric.pairs=N is how much it looks at")
         extra.append("steps_per_frame=0")
-        extra += [f"{recipe}.optimiser.decay_steps={arguments.steps // 3}" for recipe in ("held", "training")]
+        extra += [f"{section}.optimiser.decay_steps={arguments.steps // 3}" for section in _SECTIONS]
         if arguments.steps < 1:
             raise ConfigError(f"--steps {arguments.steps}: must be at least 1")
         if getattr(arguments, "minutes", 0):

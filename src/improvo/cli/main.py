@@ -71,6 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("MPLCONFIGDIR", str(cache_folder() / "matplotlib"))  # made by matplotlib, if it is used
     warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)  # of a name in a title
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # warns where it cannot make that, and works
+    arguments = argparse.Namespace()
     try:
         arguments = _parsed(words)
         _check_paths(arguments)
@@ -80,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             locations.close()
             return status
     except ImprovoError as error:
-        print(f"improvo: {one_line(locations.with_urls(str(error)))}", file=sys.stderr)
+        print(f"improvo: {one_line(locations.with_urls(_message(error, arguments)))}", file=sys.stderr)
         locations.close(success=False)
         return 2
     except KeyboardInterrupt:
@@ -96,6 +97,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print(f"improvo: {said}", file=sys.stderr)
         return 2
+
+
+def _message(error: ImprovoError, arguments: argparse.Namespace) -> str:
+    """What to say of it, in the words that the user types."""
+    from improvo.cli.begun_with import in_flags
+    from improvo.continuation import DifferentSettingsError
+
+    return in_flags(error, arguments) if isinstance(error, DifferentSettingsError) else str(error)
 
 
 def _interrupted() -> int:

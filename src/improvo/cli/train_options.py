@@ -10,6 +10,7 @@ from improvo.cli.flags import add_setting
 from improvo.cli.options import add_config_arguments, folder_path
 from improvo.cli.output import figures, next_step, say
 from improvo.errors import InputError
+from improvo.untrusted.paths import check_is_file
 from improvo.untrusted.text import load_json, reason
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def read_data_card(path: Path | None) -> tuple[DataSource, ...]:
     from improvo.frontend.weights import DataSource
 
     try:
-        sources = tuple(DataSource(**entry) for entry in load_json(path.read_text(encoding="utf-8")))
+        sources = tuple(DataSource(**entry) for entry in load_json(check_is_file(path).read_text(encoding="utf-8")))
         if not all(isinstance(text, str) for one in sources for text in (one.name, one.licence, one.attribution)):
             raise ValueError("something else than words")
     except (OSError, ValueError, TypeError) as error:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from improvo.errors import ConfigError, InputError, MissingExtraError, installed
-from improvo.frontend.masking import check_mask, unmasked, without_masked
+from improvo.frontend.masking import check_image, check_mask, unmasked, without_masked
 from improvo.types import Features, Float32, Int64, Mask, UInt8
 
 _opencv: Any = cv2  # its type stubs lack the detectors' constructors
@@ -134,6 +134,7 @@ def to_grey(image: UInt8) -> UInt8:
     Raises:
         InputError: an image of another shape or type, or without pixels.
     """
+    check_image(image)
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3) or 0 in image.shape:
         raise InputError(f"image of shape {image.shape}: give (H, W) grey or (H, W, 3) colour")
     if image.dtype != np.uint8:

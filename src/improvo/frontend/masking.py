@@ -1,4 +1,4 @@
-"""Features of a frame on its unmasked pixels: the one place where a mask is applied to a frontend."""
+"""What a frontend is given, an image and maybe a mask: the one place where a mask is applied to a frontend."""
 
 from __future__ import annotations
 
@@ -32,6 +32,17 @@ def unmasked(keypoints: Float32, mask: Mask) -> NDArray[np.bool_]:
 def without_masked(features: Features, mask: Mask | None) -> Features:
     """The features on used pixels, in their order."""
     return features if mask is None else features.take(unmasked(features.keypoints, mask))
+
+
+def check_image(image: object) -> None:
+    """Refuse what is no array, such as a path, or the None that `cv2.imread` gives for a file that it cannot read.
+
+    Raises:
+        InputError: it is none.
+    """
+    if not isinstance(image, np.ndarray):
+        nothing = "; cv2.imread gives None where it cannot read the file" if image is None else ""
+        raise InputError(f"image: is a {type(image).__name__}, give a NumPy array (H, W) or (H, W, 3){nothing}")
 
 
 def check_mask(mask: Mask | None, shape: tuple[int, ...]) -> None:

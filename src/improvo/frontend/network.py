@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from improvo.errors import InputError
 from improvo.frontend.architecture import CELL
 from improvo.frontend.decoding import decode, stability_map
-from improvo.frontend.masking import check_mask
+from improvo.frontend.masking import check_image, check_mask
 from improvo.frontend.runtime import Runtime, open_runtime
 from improvo.frontend.settings import NetworkSettings
 from improvo.frontend.weights import Weights, find_weights, load_weights
@@ -67,6 +67,8 @@ class NetworkFrontend:
         """Features of images of one size, in one pass of the network; memory grows with their number."""
         if not images:
             return []
+        for image in images:
+            check_image(image)
         sizes = {image.shape[:2] for image in images}
         if len(sizes) > 1:
             raise InputError(f"a batch needs images of one size, these have {sorted(sizes)}; pass them one by one")
@@ -109,6 +111,7 @@ def prepare(image: Image) -> Float32:
     Raises:
         InputError: an image of another shape or type, or with values out of range.
     """
+    check_image(image)
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (1, 3)) or 0 in image.shape:
         raise InputError(f"image of shape {image.shape}: the network reads (H, W) grey or (H, W, 3) colour")
     if image.dtype == np.uint8:

@@ -8,11 +8,17 @@ hidden while OpenVINO loads. A program that has imported OpenVINO before us is l
 for signal handlers, and unmaps it when it is freed. Of two cores that are freed in the order in which they were made,
 the second puts back the stack of the first, which is gone. The next signal then ends the process with a segmentation
 fault: Ctrl-C after two networks were used and dropped (seen with OpenVINO 2026.4).
+
+Graphs are built and compiled within `plain_letters()`. OpenVINO compares the names of options without regard to case by
+the letters of the C library, and in Turkish and Azerbaijani `i` is not the small letter of `I`: there, it knows no
+`EXPLICIT` padding, and no network could be run.
 """
 
 from __future__ import annotations
 
+import locale
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -40,4 +46,21 @@ with _hidden(_TELEMETRY):
 
 CORE = openvino.Core()
 
-__all__ = ["CORE", "openvino", "opset13"]
+_LETTERS = threading.Lock()  # the locale belongs to the process
+
+
+@contextmanager
+def plain_letters() -> Iterator[None]:
+    """Meanwhile the C library has the letters of English; one thread at a time."""
+    with _LETTERS:
+        before = locale.setlocale(locale.LC_CTYPE)
+        if before != "C":
+            locale.setlocale(locale.LC_CTYPE, "C")
+        try:
+            yield
+        finally:
+            if before != "C":
+                locale.setlocale(locale.LC_CTYPE, before)
+
+
+__all__ = ["CORE", "openvino", "opset13", "plain_letters"]

@@ -14,7 +14,7 @@ NETWORKS = ("superpoint-vo", "superpoint", "superpoint-vo-small", "superpoint-sm
 
 
 def load_frontend(
-    name: str = DEFAULT_FRONTEND,
+    name: str | Path = DEFAULT_FRONTEND,
     max_keypoints: int = 1000,
     *,
     least_stability: float = 0.0,
@@ -34,12 +34,15 @@ def load_frontend(
         opencv_defaults: the classical frontends as OpenCV has them, which the paper compares with.
 
     Raises:
-        ConfigError: an unknown name, network options for a classical frontend, or `least_stability` for a frontend
-            without a stability head.
+        ConfigError: an unknown name, no keypoints, network options for a classical frontend, or `least_stability` for
+            a frontend without a stability head.
         MissingExtraError: `surf` without the package mahotas.
         InputError: a weights file that cannot be read.
     """
+    name = str(name)
     check_frontend(name, network)
+    if max_keypoints < 1:
+        raise ConfigError(f"setting `max_keypoints`: must be at least 1, not {max_keypoints}")
     if name == "surf":
         from improvo.frontend.classical import SurfFrontend
 

@@ -17,7 +17,7 @@ from improvo.frontend.int8 import (
     largest_of_channels,
     spread_over_copies,
 )
-from improvo.frontend.openvino_library import CORE
+from improvo.frontend.openvino_library import CORE, plain_letters
 from improvo.frontend.openvino_library import openvino as ov
 from improvo.frontend.openvino_library import opset13 as ops
 from improvo.frontend.runtime import NetworkMaps
@@ -69,7 +69,8 @@ class OpenVinoRuntime:
         with self._compiling:
             found = self._compiled.get(shape)
             if found is None:
-                compiled = CORE.compile_model(self._graph.model(shape), "CPU", self._options)
+                with plain_letters():
+                    compiled = CORE.compile_model(self._graph.model(shape), "CPU", self._options)
                 found = _kept(self._compiled, shape, compiled)
             return found
 
@@ -85,7 +86,8 @@ def _kept(cache: dict[tuple[int, ...], Any], shape: tuple[int, ...], value: Any)
 def activation_ranges(weights: Weights, images: Float32, quantile: float) -> dict[str, float]:
     """The `quantile` of what each convolution reads over (B, 1, H, W) images, by the name of the one that reads it."""
     graph = _Graph(weights, {})
-    compiled = CORE.compile_model(graph.model(images.shape, taps=True), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+    with plain_letters():
+        compiled = CORE.compile_model(graph.model(images.shape, taps=True), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
     found = compiled([images])
     return {reader: float(np.quantile(found[position], quantile)) for position, reader in enumerate(graph.readers)}
 

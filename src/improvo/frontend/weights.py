@@ -54,7 +54,7 @@ class Weights:
     """A weights file in memory."""
 
     card: ModelCard
-    tensors: dict[str, Float32]  # keys and shapes of `SuperPoint(card.architecture).state_dict()`
+    tensors: dict[str, Float32] = field(repr=False)  # keys, shapes: `SuperPoint(card.architecture).state_dict()`
 
     @property
     def architecture(self) -> Architecture:

@@ -114,12 +114,13 @@ class _RecordedImages:
         return self._sequence.mask(int(self._rows[frame]))
 
 
-def read_labels(folder: Path) -> list[LabeledSequence]:
+def read_labels(folder: Path | str) -> list[LabeledSequence]:
     """All finished sequences of a store, by name.
 
     Raises:
         InputError: no store, or one without any finished sequence.
     """
+    folder = Path(folder)
     records = read_records(folder)
     try:
         values = SettingsRecord(folder / SETTINGS_FILE).read()

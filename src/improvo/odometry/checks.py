@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,23 @@ from improvo.geometry.camera import Camera
 from improvo.types import Features, Frame
 
 
-def check_frame(frame: Frame, camera: Camera, before: float | None) -> None:
+def check_parts(frontend: object, camera: object) -> None:
+    """Refuse what an odometry cannot be made of.
+
+    Raises:
+        InputError: the camera has distortion, which the odometry would leave out without a word.
+        TypeError: a name or file in place of the frontend, or something else in place of the camera.
+    """
+    if isinstance(frontend, str | Path):
+        raise TypeError(f"frontend: is a {type(frontend).__name__}, give `improvo.load_frontend({str(frontend)!r})`")
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera: is a {type(camera).__name__}, give an `improvo.Camera`, or that of a sequence")
+    if not camera.is_pinhole:
+        mend = "undistort the pictures and give the camera that they have then, as `improvo.open_sequence` does"
+        raise InputError(f"camera: has distortion, and the odometry reads undistorted pictures; {mend}")
+
+
+def check_frame(frame: object, camera: Camera, before: float | None) -> None:
     """Refuse a picture that is not what the camera makes.
 
     Args:
@@ -24,8 +41,12 @@ def check_frame(frame: Frame, camera: Camera, before: float | None) -> None:
         before: time of the frame before; None for the first.
 
     Raises:
+        TypeError: it is no frame.
         InputError: it has another size or type, or the time is no number above the one before.
     """
+    if not isinstance(frame, Frame):
+        mend = 'give `improvo.Frame(number, seconds, image, "my camera")`'
+        raise TypeError(f"frame: is a {type(frame).__name__}; {mend}")
     image: Any = frame.image
     wanted = f"this odometry reads uint8 pictures of {camera.width}x{camera.height}, those of its camera"
     if not isinstance(image, np.ndarray):

@@ -60,8 +60,8 @@ class RunFolder:
         InputError: the folder has no readable run.json.
     """
 
-    def __init__(self, path: Path, sequence_path: Path | None = None) -> None:
-        self.path = path
+    def __init__(self, path: Path | str, sequence_path: Path | None = None) -> None:
+        self.path = path = Path(path)
         self._sequence_path = sequence_path
         if not path.is_dir():
             raise InputError(f"{path}: no such folder; give the output folder of `improvo run`")

@@ -12,7 +12,7 @@ from improvo.frontend import Frontend
 from improvo.frontend.registry import CLASSICAL
 from improvo.geometry.camera import Camera
 from improvo.odometry.alarms.world_keypoints import WorldKeypoints
-from improvo.odometry.checks import OneThread, check_features, check_frame, check_time
+from improvo.odometry.checks import OneThread, check_features, check_frame, check_parts, check_time
 from improvo.odometry.events import Event, EventLog
 from improvo.odometry.mapper import Mapper
 from improvo.odometry.paper import PaperMapper
@@ -63,12 +63,16 @@ class VisualOdometry:
 
     Args:
         frontend: gives the features of an image.
-        camera: pinhole camera of the frames.
+        camera: pinhole camera of the frames, which are undistorted already.
         settings: all numbers.
         use_stability: weigh observations with the frontend's stability (w_ij), or with 1.
         on_final: called with each frame that nothing can change any more.
         camera_is_guess: the focal length is a guess. What a camera that only turns explains as well, with another
             focal length, is doubtful then.
+
+    Raises:
+        InputError: the camera has distortion.
+        TypeError: a name or file in place of the frontend, or something else in place of the camera.
     """
 
     def __init__(
@@ -80,6 +84,7 @@ class VisualOdometry:
         on_final: Callable[[FinalView], None] | None = None,
         camera_is_guess: bool = False,
     ) -> None:
+        check_parts(frontend, camera)
         self._detect = WorldKeypoints(frontend)
         self._camera = camera
         self._settings = settings or OdometrySettings()
@@ -105,9 +110,10 @@ class VisualOdometry:
         self.finish()
 
     def track(self, frame: Frame) -> TrackedFrame:
-        """Process the next frame.
+        """Process the next frame, of a sequence or made by hand: `Frame(number, seconds, image, "my camera")`.
 
         Raises:
+            TypeError: it is no `Frame`, but a bare picture for example.
             RuntimeError: the odometry has finished, or another thread is tracking with it.
             InputError: the picture has another size or type than the camera's, or its time is not after that of the
                 frame before; nothing has changed then.

@@ -7,6 +7,7 @@ from typing import Any
 
 from improvo.errors import InputError
 from improvo.report.page import Page, as_json
+from improvo.untrusted.paths import check_is_file
 from improvo.untrusted.text import read_json_file, reason
 
 # evaluation -> (title, what the numbers mean)
@@ -65,7 +66,7 @@ def write_evaluation_page(folder: Path, path: Path) -> None:
 def _tables(page: Page, folder: Path, name: str) -> None:
     path, mend = folder / f"{name}.md", f"run `improvo evaluate {name}` again"
     try:
-        text = path.read_text(encoding="utf-8")
+        text = check_is_file(path).read_text(encoding="utf-8")
     except FileNotFoundError:
         raise InputError(f"{path}: is missing; {mend}") from None
     except (OSError, ValueError) as error:

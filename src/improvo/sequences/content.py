@@ -10,6 +10,7 @@ from improvo.sequences.base import Recording, UnreadableFrameError
 
 _SAMPLE = 1 << 20  # bytes at the beginning, in the middle and at the end of a file
 _DIGEST_BYTES = 16
+_DEPTH_MAPS = 16  # pairs of neighbours that are decoded
 
 
 def content_of(recording: Recording) -> str:
@@ -34,6 +35,27 @@ def content_of(recording: Recording) -> str:
             continue
         digest.update(str(picture.shape).encode() + picture.tobytes())
     return digest.hexdigest()
+
+
+def depth_content(recording: Recording) -> str:
+    """A digest of a recording's depth, hexadecimal, by some of its maps evenly spread over all frames.
+
+    It is no part of `content_of`, since features, tracks and labels do not depend on it, as true measures do.
+    """
+    digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
+    for index in range(0, len(recording), max(len(recording) // _DEPTH_MAPS, 1)):
+        for neighbour in (index, index + 1):  # some recordings have depth for every second frame
+            if neighbour < len(recording):
+                digest.update(_depth_bytes(recording, neighbour))
+    return digest.hexdigest()
+
+
+def _depth_bytes(recording: Recording, index: int) -> bytes:
+    try:
+        depth = recording.depth(index)
+    except (InputError, UnreadableFrameError):  # this map is damaged or missing
+        depth = None
+    return b"none" if depth is None else str(depth.shape).encode() + depth.tobytes()
 
 
 def _add_file(digest: hashlib.blake2b, path: Path) -> None:

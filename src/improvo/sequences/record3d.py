@@ -21,6 +21,7 @@ from improvo.sequences.varying_camera import median_calibration, numbers, read_j
 from improvo.types import Float32, Float64, UInt8
 from improvo.untrusted.arrays import FAULTS
 from improvo.untrusted.limits import MAX_ARRAY_BYTES, MAX_JSON_BYTES, MAX_PIXELS
+from improvo.untrusted.paths import check_is_file
 from improvo.untrusted.text import reason
 
 
@@ -118,10 +119,12 @@ class _Folder:
 
     def read(self, name: str, limit: int = MAX_ARRAY_BYTES) -> bytes:
         try:
-            with (self._path / name).open("rb") as file:
+            with check_is_file(self._path / name).open("rb") as file:
                 return file.read(limit)
+        except InputError:
+            raise UnreadableFrameError("is a pipe or a device, not a file") from None
         except OSError as error:
-            raise UnreadableFrameError(error.strerror or str(error)) from None
+            raise UnreadableFrameError(reason(error)) from None
 
 
 class _Archive:

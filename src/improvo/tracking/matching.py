@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from improvo.compiled import compiled
+from improvo.errors import InputError
 from improvo.types import Features, Float32, Int64
 
 RANDOM_DISTANCE = float(np.sqrt(2.0))  # expected distance of two unrelated unit descriptors
@@ -40,7 +41,15 @@ def mutual_nearest_neighbours(a: Features, b: Features, max_distance: float | No
     Args:
         a, b: features of two images, by the same frontend.
         max_distance: tau, drop pairs farther apart (scaled for binary descriptors); None keeps all.
+
+    Raises:
+        InputError: descriptors of two kinds, which no distance compares.
     """
+    if a.binary != b.binary or a.descriptors.shape[1] != b.descriptors.shape[1]:
+        kinds = " and ".join(f"{each.descriptors.shape[1]} {each.descriptors.dtype}" for each in (a, b))
+        raise InputError(
+            f"features: descriptors of {kinds} numbers cannot be matched; use one frontend for both images"
+        )
     threshold = None if max_distance is None else distance_threshold(a, max_distance)
     return match_units(unit_descriptors(a), unit_descriptors(b), threshold)
 

@@ -16,6 +16,7 @@ from improvo.sequences.images import read_grey
 from improvo.training.settings import ViewSettings
 from improvo.training.views import random_view, warp_image
 from improvo.types import Float64, UInt8
+from improvo.untrusted.paths import check_is_file
 
 SUFFIXES = (".ppm", ".pgm", ".png", ".jpg", ".jpeg", ".bmp")
 SPLITS = {"i": "illumination", "v": "viewpoint"}  # first letter of an HPatches folder
@@ -133,7 +134,8 @@ def _read_image(path: str, longest_side: int) -> tuple[UInt8, Float64]:
 
 def _read_homography(path: str) -> Float64:
     try:
-        matrix = np.array(Path(path).read_text(encoding="utf-8").split(), np.float64).reshape(3, 3)
+        text = check_is_file(Path(path)).read_text(encoding="utf-8")
+        matrix = np.array(text.split(), np.float64).reshape(3, 3)
     except (OSError, UnicodeDecodeError, ValueError):
         raise InputError(f"{path}: must hold the nine numbers of a homography; mend the file") from None
     if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:

@@ -14,6 +14,8 @@ from improvo.evaluation.trajectory.protocol import clean_truth
 from improvo.sequences import Sequence
 from improvo.types import Float64, Int64
 
+_FEWEST_BLOCKS = 8
+
 
 @dataclass(frozen=True)
 class SequencePairs:
@@ -88,6 +90,20 @@ def pairs_of_sequence(sequence: Sequence, gaps: tuple[int, ...], count: int, see
         raise InputError(f"{path}: has no depth, which the pose protocol needs; use an RGB-D sequence")
     invalid = tuple(int(i) for i in np.flatnonzero(unusable))
     return SequencePairs(name, path, len(truth), truth.world_from_cam, invalid, pairs)
+
+
+def overlapping(pairs: Int64) -> int:
+    """How many neighbouring pairs (K, 2) of a gap are drawn together for an interval; the pairs are in order.
+
+    As many as lie within one gap: from its first pair to its last, these look at some of the same frames. At most an
+    eighth of all, since the fewer blocks there are, the more alike are the resamples, and the interval would be narrow
+    for want of pairs.
+    """
+    if len(pairs) < 2:
+        return 1
+    spacing = float(np.median(np.diff(pairs[:, 0])))
+    within = int(np.ceil((pairs[0, 1] - pairs[0, 0]) / max(spacing, 1.0)))
+    return max(1, min(within, -(-len(pairs) // _FEWEST_BLOCKS)))
 
 
 def refuse_empty_gaps(sequences: list[SequencePairs], gaps: tuple[int, ...]) -> None:

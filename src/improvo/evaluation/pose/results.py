@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from improvo.config import to_dict
 from improvo.evaluation.measures import relative_motion
+from improvo.evaluation.pose.pairs import overlapping
 from improvo.evaluation.pose.protocol import Records
 from improvo.evaluation.pose.run import PoseRun
 from improvo.evaluation.settings import PoseSettings
@@ -154,9 +155,10 @@ def _sequence(run: PoseRun, number: int) -> dict[str, Any]:
 
 
 def _bootstrap(records: Records, settings: PoseSettings) -> Bootstrap:
-    """Resamples of the pairs in `records`, the same for every frontend and solver."""
-    pairs = int(((records["frontend"] == 0) & (records["estimator"] == 0) & (records["shuffle"] == 0)).sum())
-    return Bootstrap(pairs, settings.seed, settings.resamples, settings.confidence)
+    """Resamples of the pairs in `records`, the same for every frontend and solver; neighbours are drawn together."""
+    once = records[(records["frontend"] == 0) & (records["estimator"] == 0) & (records["shuffle"] == 0)]
+    block = overlapping(np.stack([once["a"], once["b"]], axis=1).astype(np.int64))
+    return Bootstrap(len(once), settings.seed, settings.resamples, settings.confidence, block)
 
 
 def _finite(value: float) -> float | None:

@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 from improvo.config import check_seed
 from improvo.errors import ConfigError, InputError
 from improvo.evaluation.measures import PairGeometry, relative_motion
+from improvo.evaluation.pose.pairs import overlapping
 from improvo.evaluation.pose.protocol import Records, evaluate_pair
 from improvo.evaluation.pose.results import share
 from improvo.evaluation.settings import DEFAULT_ESTIMATORS, PoseSettings
 from improvo.evaluation.statistics import Bootstrap, below
 from improvo.geometry.camera import Camera
 from improvo.types import Features, Float32, Float64, Int64
-
-_FEWEST_BLOCKS = 8
 
 
 @dataclass(frozen=True)
@@ -92,20 +91,6 @@ def choose_pairs(run: FixedRun, gap: int, count: int) -> Int64:
     first = first[together & run.has_depth[first]]
     spread = np.unique(np.linspace(0, len(first) - 1, min(count, len(first))).round().astype(np.int64))
     return np.stack([first[spread], first[spread] + gap], axis=1)
-
-
-def overlapping(pairs: Int64) -> int:
-    """How many neighbours of `choose_pairs` (K, 2) are drawn together for an interval.
-
-    As many as lie within one gap: from its first pair to its last, these look at some of the same frames. At most an
-    eighth of all, since the fewer blocks there are, the more alike are the resamples, and the interval would be narrow
-    for want of pairs.
-    """
-    if len(pairs) < 2:
-        return 1
-    spacing = float(np.median(np.diff(pairs[:, 0])))
-    within = int(np.ceil((pairs[0, 1] - pairs[0, 0]) / max(spacing, 1.0)))
-    return max(1, min(within, -(-len(pairs) // _FEWEST_BLOCKS)))
 
 
 def score_pairs(

@@ -13,6 +13,7 @@ from improvo.errors import InputError
 from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.images import read_grey
 from improvo.types import Float32, Int64, UInt8
+from improvo.untrusted.paths import check_is_file
 from improvo.untrusted.text import load_json
 
 STATIC = 0
@@ -33,7 +34,7 @@ class TrueCauses:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         try:
-            text = (folder / "simulation.json").read_text(encoding="utf-8")
+            text = check_is_file(folder / "simulation.json").read_text(encoding="utf-8")
             self.codes: dict[str, int] = dict(load_json(text)["causes"])
         except (OSError, ValueError, KeyError, TypeError):
             raise InputError(

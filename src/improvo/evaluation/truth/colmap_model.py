@@ -17,6 +17,7 @@ from improvo.geometry.camera_files import Calibration, colmap_calibration
 from improvo.geometry.se3 import rigid, rotation_from_quat_xyzw
 from improvo.geometry.text_files import read_text
 from improvo.types import Float64
+from improvo.untrusted.paths import check_is_file
 
 # COLMAP's model numbers, with the number of parameters
 _MODELS = {
@@ -104,7 +105,7 @@ def _text_images(folder: Path) -> list[_Image]:
 def _binary_cameras(folder: Path) -> dict[int, Calibration]:
     path = folder / "cameras.bin"
     found = {}
-    with path.open("rb") as file:
+    with check_is_file(path).open("rb") as file:
         for _ in range(_numbers(file, "<Q")[0]):
             number, model, width, height = _numbers(file, "<iiQQ")
             if model not in _MODELS:

@@ -72,10 +72,15 @@ def from_field_of_view(fov: float, width: int, height: int) -> Calibration:
     """A pinhole with this horizontal field of view in degrees, principal point in the middle.
 
     Raises:
-        InputError: an angle that no pinhole has.
+        InputError: an angle that no pinhole has, or that no lens has across so narrow a picture.
     """
     check_field_of_view(fov, "--fov")
     focal = 0.5 * width / math.tan(math.radians(fov) / 2)
+    if focal < _RELATIVE * max(width, height):
+        raise InputError(
+            f"pictures of {width}x{height} are too narrow for a field of view of {fov:g} degrees across their width, "
+            "as --fov has it; give the camera itself by --camera fx,fy,cx,cy"
+        )
     return Calibration("--fov", (focal, focal, (width - 1) / 2, (height - 1) / 2), size=(width, height))
 
 
