@@ -77,6 +77,14 @@ def test_a_scale_counts_by_what_it_does_to_the_path_there() -> None:
     assert middle.uncertain == end.uncertain == ((10, 30),)  # told in both cases
 
 
+def test_a_smaller_error_is_enough_where_the_scale_of_most_frames_is_not_determined() -> None:
+    steps, leverage = np.array([[0.01] * 6, [0.15] * 6]), np.array([8.0, 0.5])
+    for frames, word in (((0, 60), RIGHT), ((0, 40), DOUBTFUL)):  # 20 of 60 and of 40
+        verdict = changed(error_percent=np.full(6, 1.5), scale_steps=steps, leverage=leverage, frames=frames)
+        assert verdict.uncertain == ((10, 30),)
+        assert verdict.word == word
+
+
 def test_a_place_that_may_only_look_the_same_is_told() -> None:
     verdict = changed(leaps=(SeenAgain((12, 13), 90, 9),))
     assert verdict.evidence[-1].startswith(

@@ -55,6 +55,7 @@ class Spread:
         turning: what a camera that only turns says of the windows; empty where the focal length is no guess.
         views_per_point: keyframes that observe a point, mean.
         leaps: gaps between keyframes across which the place may only look the same (`seen_again.py`).
+        frames: first and last keyframe's.
     """
 
     error_percent: Float64
@@ -68,6 +69,7 @@ class Spread:
     turning: tuple[TurningCamera, ...] = ()
     views_per_point: float = 1.0
     leaps: tuple[SeenAgain, ...] = ()
+    frames: tuple[int, int] = (0, 0)
 
 
 @dataclass
@@ -171,6 +173,7 @@ class EvidenceCheck:
             turning=tuple(self._turning),
             views_per_point=self._observations / max(int(self._is_seen.sum()), 1),
             leaps=found,
+            frames=(self._frames[0], self._frames[-1]),
         )
 
     def _mark_unknown_gaps(self) -> tuple[SeenAgain, ...]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from improvo.odometry.gates import SAME_SCALE
+from improvo.odometry.gates import LARGE_PART, SAME_SCALE
 from improvo.odometry.settings import VerdictSettings
 from improvo.odometry.verdict.evidence import HALVES, PARTS, QUARTERS, Spread
 from improvo.odometry.verdict.seen_again import SeenAgain
@@ -88,7 +88,12 @@ def judge(
     alarms = (*alarms, *_said_of_turning(spread))
     error = estimated_error(spread)
     uncertain = _uncertain(spread)
-    limit = settings.max_error * _SUSPECTED ** (suspected if suspicions else 0)
+    times = suspected if suspicions else 0
+    first, last = spread.frames
+    if sum(b - a for a, b in uncertain) > LARGE_PART * (last - first) > 0:
+        suspicions = (*suspicions, "over a large part of it the scale is not determined")
+        times += 1
+    limit = settings.max_error * _SUSPECTED**times
     word = RIGHT if error <= limit and not alarms else DOUBTFUL
     if word == RIGHT:  # what speaks for it comes first
         evidence = [_in_words(spread, error), *(f"although {suspicion}" for suspicion in suspicions)]
