@@ -20,7 +20,9 @@ from improvo.odometry.view import View
 from improvo.sequences import SequenceSettings
 from improvo.types import Float64
 
-GOOD = Spread(np.full(len(PARTS), 0.3), np.full((2, len(PARTS)), 0.01), np.array([[0, 20], [10, 30]]), 0.3, 640)
+GOOD = Spread(
+    np.full(len(PARTS), 0.3), np.full((2, len(PARTS)), 0.01), np.array([[0, 20], [10, 30]]), np.full(2, 8.0), 0.3, 640
+)
 TURNED = TurningCamera(error_px=0.5, map_px=0.4, fov=25.0, moved=0.2)
 
 

@@ -15,6 +15,7 @@ from improvo.odometry.settings import VerdictSettings
 from improvo.odometry.verdict.evidence import PARTS, Spread
 from improvo.odometry.verdict.evidence_window import EvidenceKeyframe, EvidenceWindow
 from improvo.odometry.verdict.lens_evidence import LensMeasure, measured_lens
+from improvo.odometry.verdict.seen_again import SeenAgain
 from improvo.odometry.verdict.told_verdicts import doubtful_frames, uncertain_frames, verdict_lines
 from improvo.odometry.verdict.verdict import DOUBTFUL, NOT_JUDGED, RIGHT, Verdict, estimated_error, joined, judge
 from improvo.types import Float64
@@ -24,6 +25,7 @@ GOOD = Spread(
     error_percent=np.full(len(PARTS), 0.3),
     scale_steps=np.full((2, len(PARTS)), 0.01),
     link_frames=np.array([[0, 20], [10, 30]]),
+    leverage=np.full(2, 8.0),
     noise_px=0.3,
     width=640,
 )
@@ -36,8 +38,8 @@ def changed(**changes: Any) -> Verdict:
 def test_a_good_spread_is_right_and_says_what_the_estimate_rests_on() -> None:
     verdict = judge(GOOD, SETTINGS)
     assert verdict.word == RIGHT
-    assert verdict.error_percent == pytest.approx(np.sqrt(6 * 0.3**2 + (40 * 0.01) ** 2))
-    assert verdict.evidence[0].startswith("estimated error 0.8 % of the path: ")
+    assert verdict.error_percent == pytest.approx(1.15 * np.sqrt(6 * 0.3**2 + (6 * 8 * 0.01) ** 2))
+    assert verdict.evidence[0].startswith("estimated error 1.0 % of the path: ")
 
 
 def test_each_kind_of_evidence_can_make_a_segment_doubtful() -> None:
@@ -52,10 +54,10 @@ def test_each_kind_of_evidence_can_make_a_segment_doubtful() -> None:
     alarmed = judge(GOOD, SETTINGS, ("two motions",))
     assert (alarmed.word, alarmed.evidence[0]) == (DOUBTFUL, "two motions")
     assert judge(GOOD, SETTINGS, (), ("two motions",)).word == RIGHT
-    worse = replace(GOOD, error_percent=np.full(6, 1.8))
+    worse = replace(GOOD, error_percent=np.full(6, 1.5))
     assert (judge(worse, SETTINGS).word, judge(worse, SETTINGS, (), ("two motions",)).word) == (RIGHT, DOUBTFUL)
     assert judge(worse, SETTINGS, (), ("two maps were contradicted",), 2).word == DOUBTFUL
-    slightly = replace(GOOD, error_percent=np.full(6, 1.35))
+    slightly = replace(GOOD, error_percent=np.full(6, 1.0))
     words = [judge(slightly, SETTINGS, (), ("contradicted",), times).word for times in (1, 2)]
     assert words == [RIGHT, DOUBTFUL]
     told = judge(worse, SETTINGS, (), ("one map was contradicted",), 0)
@@ -66,6 +68,28 @@ def test_each_kind_of_evidence_can_make_a_segment_doubtful() -> None:
         assert told.evidence[0].endswith(words)
     assert judge(None, SETTINGS).word == NOT_JUDGED
     assert judge(None, SETTINGS, ("two motions",)).word == DOUBTFUL
+
+
+def test_a_scale_counts_by_what_it_does_to_the_path_there() -> None:
+    steps = np.array([[0.01] * 6, [0.15] * 6])
+    middle, end = (changed(scale_steps=steps, leverage=np.array([8.0, each])) for each in (8.0, 0.5))
+    assert (middle.word, end.word) == (DOUBTFUL, RIGHT)
+    assert middle.uncertain == end.uncertain == ((10, 30),)  # told in both cases
+
+
+def test_a_smaller_error_is_enough_where_the_scale_of_most_frames_is_not_determined() -> None:
+    steps, leverage = np.array([[0.01] * 6, [0.15] * 6]), np.array([8.0, 0.5])
+    for frames, word in (((0, 60), RIGHT), ((0, 40), DOUBTFUL)):  # 20 of 60 and of 40
+        verdict = changed(error_percent=np.full(6, 1.5), scale_steps=steps, leverage=leverage, frames=frames)
+        assert verdict.uncertain == ((10, 30),)
+        assert verdict.word == word
+
+
+def test_a_place_that_may_only_look_the_same_is_told() -> None:
+    verdict = changed(leaps=(SeenAgain((12, 13), 90, 9),))
+    assert verdict.evidence[-1].startswith(
+        "frames 12 to 13: the place may only look like the one before, 9 of 90 points"
+    )
 
 
 def test_a_half_of_the_points_that_is_bad_by_chance_does_not_count_and_noise_does() -> None:
@@ -176,7 +200,7 @@ def test_joined_stretches_are_doubtful_by_their_scale_and_by_what_made_one_of_th
             assert np.isfinite(both.error_percent)
             assert joined(both, good, 0.01, (1.0, 99.0)).word == DOUBTFUL
     suspected = judge(GOOD, SETTINGS, (), ("two motions",))
-    larger = changed(error_percent=np.full(6, 1.8))
+    larger = changed(error_percent=np.full(6, 1.5))
     assert (larger.word, suspected.word) == (RIGHT, RIGHT)
     assert joined(larger, suspected, 0.0, (99.0, 1.0)).word == DOUBTFUL  # over the smaller limit
 

@@ -14,14 +14,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from improvo.backend.solver import solve
-from improvo.errors import InputError
 from improvo.geometry import se3
-from improvo.geometry.alignment import align_points
 from improvo.geometry.camera import Camera
 from improvo.odometry.gates import SAME_SCALE
 from improvo.odometry.mapping.window import OBJECTIVE, SOLVER
 from improvo.odometry.verdict.evidence_window import EvidenceKeyframe, EvidenceWindow
 from improvo.odometry.verdict.lens_evidence import LensMeasure, measured_lens
+from improvo.odometry.verdict.path_error import error_percent, scale_leverage
+from improvo.odometry.verdict.seen_again import SeenAgain, leaps, looked_again
 from improvo.odometry.verdict.shared_errors import shared_error
 from improvo.odometry.verdict.turning_camera import TurningCamera, turning_camera
 from improvo.odometry.view import View
@@ -35,7 +35,6 @@ _WINDOW = 12  # keyframes that are adjusted together from each part of the evide
 _FEW = 8  # observations or common points; fewer determine nothing
 _THIN = 6  # points seen on both sides of a gap between two keyframes; fewer carry no scale across it
 _UNKNOWN_SCALE = float(np.log(2.0))  # where no point is, the scale of what follows may as well be half or double
-_ROUNDING = 1e-12  # of coordinates, as a share of their size; positions that differ by less are one
 _HASH = 2654435761  # a multiplier of Knuth's, so that the halves of the points are no halves of time or place
 
 
@@ -48,23 +47,29 @@ class Spread:
         scale_steps: (L, PARTS) change of the logarithm of a part's scale across each of L links between windows, and
             across each gap that no point bridges.
         link_frames: (L, 2) first and last frame of the keyframes on both sides of each link.
+        leverage: (L,) what a change of scale there does to the path: % of it, per unit of the logarithm.
         noise_px: of the observations, standard deviation of one coordinate; NaN where nothing was observed.
         width: of the picture in pixels.
         lens: what the windows say of the focal length.
         shared_px: of the residuals, what neighbours in the picture have in common (`shared_errors.py`).
         turning: what a camera that only turns says of the windows; empty where the focal length is no guess.
         views_per_point: keyframes that observe a point, mean.
+        leaps: gaps between keyframes across which the place may only look the same (`seen_again.py`).
+        frames: first and last keyframe's.
     """
 
     error_percent: Float64
     scale_steps: Float64
     link_frames: Int64
+    leverage: Float64
     noise_px: float
     width: int
     lens: tuple[LensMeasure, ...] = ()
     shared_px: float = 0.0
     turning: tuple[TurningCamera, ...] = ()
     views_per_point: float = 1.0
+    leaps: tuple[SeenAgain, ...] = ()
+    frames: tuple[int, int] = (0, 0)
 
 
 @dataclass
@@ -112,6 +117,8 @@ class EvidenceCheck:
         self._is_seen = np.zeros(0, np.bool_)  # by map point
         self._scale_steps: list[Float64] = []
         self._links: list[tuple[int, int]] = []
+        self._places: list[tuple[int, int]] = []  # of each link: the scale may be another behind one of these keyframes
+        self._seen_again: list[SeenAgain] = []
         self._lens: list[LensMeasure] = []
         self._lens_due = True  # every other window: those between them share half of their keyframes with each
 
@@ -128,6 +135,7 @@ class EvidenceCheck:
             view.frame_index, cam_from_world, view.keypoints[rows], view.points[rows], view.weights[rows]
         )
         self._pending.append(keyframe)
+        looked_again(self._seen_again, self._pending, xyz, self._camera)
         self._centers.append(se3.inverse(cam_from_world)[:3, 3])
         self._frames.append(view.frame_index)
         if len(xyz) > len(self._is_seen):
@@ -151,28 +159,37 @@ class EvidenceCheck:
         if len(self._centers) < 3:
             return None
         own = np.stack(self._centers)
-        self._mark_empty_gaps(own)
+        found = self._mark_unknown_gaps()
         errors = [error_percent(np.stack(path.centers), own) for path in self._paths]
         return Spread(
             error_percent=np.array(errors),
             scale_steps=np.array(self._scale_steps).reshape(-1, len(PARTS)),
             link_frames=np.array(self._links, np.int64).reshape(-1, 2),
+            leverage=scale_leverage(own, self._places),
             noise_px=float(np.median(self._errors)) / 1.1774 if self._errors else float("nan"),
             width=self._camera.width,
             lens=tuple(self._lens),
             shared_px=float(np.median(self._shared)) if self._shared else 0.0,
             turning=tuple(self._turning),
             views_per_point=self._observations / max(int(self._is_seen.sum()), 1),
+            leaps=found,
+            frames=(self._frames[0], self._frames[-1]),
         )
 
-    def _mark_empty_gaps(self, centers: Float64) -> None:
-        """Gaps that no point bridges: the scale of the shorter side is unknown, and so is the step between the two."""
-        steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-        for gap in sorted(gap for gap, count in self._across.items() if count == 0):
-            longer = max(steps[:gap].sum(), steps[gap + 1 :].sum()) / max(steps.sum(), 1e-300)
-            unknown = _UNKNOWN_SCALE * min(2.0 * (1.0 - longer), 1.0)
-            self._scale_steps.append(np.full(len(PARTS), max(unknown, SAME_SCALE)))
+    def _mark_unknown_gaps(self) -> tuple[SeenAgain, ...]:
+        """The scale behind a gap is unknown where no point bridges it, or a place that may only look the same.
+
+        Returns:
+            Gaps of the second kind.
+        """
+        places = {gap for gap, count in self._across.items() if count == 0}
+        found = leaps(self._seen_again)
+        places.update(self._frames.index(gap.frames[0]) for gap in found)
+        for gap in sorted(places):
+            self._scale_steps.append(np.full(len(PARTS), _UNKNOWN_SCALE))
             self._links.append((self._frames[gap], self._frames[gap + 1]))
+            self._places.append((gap, gap))
+        return found
 
     def _solve_window(self, xyz: Float64) -> None:
         """All parts of the pending keyframes; the second half of them is the overlap with the next window."""
@@ -195,6 +212,9 @@ class EvidenceCheck:
         if self._overlap or thin:
             self._scale_steps.append(steps)
             self._links.append(frames)
+            thinnest = before + int(across.argmin())
+            newest = before + max(self._overlap - 1, 0), before + len(keyframes) - 2
+            self._places.append((thinnest, thinnest) if thin else newest)
         if self._lens_due and len(keyframes) >= _FEW:
             self._lens.append(measured_lens(window, frames, self._camera))
         if self._lens_due and self._camera_is_guess:
@@ -220,22 +240,6 @@ class EvidenceCheck:
             return _Solution(window.cam_from_world, rows, window.ids[rows], window.xyz[rows])
         result = solve(problem, OBJECTIVE, SOLVER)
         return _Solution(result.cam_from_world, rows, window.ids[rows], result.points)
-
-
-def error_percent(path: Float64, reference: Float64) -> float:
-    """Root mean square distance of positions (N, 3) after Sim3, as % of the reference's path.
-
-    Infinite where one of them stands still: Sim3 would shrink any path onto a reference on one spot, and be right.
-    """
-    size = float(np.abs(reference).max(initial=1.0))
-    if np.ptp(reference, axis=0).max() <= _ROUNDING * size:
-        return float("inf")
-    length = np.linalg.norm(np.diff(reference, axis=0), axis=1).sum()
-    try:
-        aligned = align_points(reference, path, with_scale=True).apply(path)
-    except InputError:  # all on one spot
-        return float("inf")
-    return float(100.0 * np.sqrt(((aligned - reference) ** 2).sum(axis=1).mean()) / max(length, 1e-300))
 
 
 def _continue(path: _Path, solution: _Solution, window: EvidenceWindow, overlap: int) -> float:

@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from improvo.odometry.gates import SAME_SCALE
+from improvo.odometry.gates import LARGE_PART, SAME_SCALE
 from improvo.odometry.settings import VerdictSettings
 from improvo.odometry.verdict.evidence import HALVES, PARTS, QUARTERS, Spread
+from improvo.odometry.verdict.seen_again import SeenAgain
 from improvo.types import Float64
 
-_SCALE_SHARE = 40.0  # % of the path that a change of scale by the factor e moves (calibrated: docs/odometry.md)
+_SCALE_FACTOR = 6.0  # times what the parts disagree about a scale by (calibrated: docs/odometry.md)
+_COVERAGE = 1.15  # times the spread, for what all parts are off by together (docs/robustness-odometry.md)
 _USUAL_NOISE = 0.0016  # share of the picture's width; the estimate grows with noise that is larger
 _USUAL_SHARED = 0.0007  # the same of what neighbours are off by together: up to 0.0006 by a camera known roughly
 _USUAL_VIEWS = 4.0  # keyframes that observe a point; more of them average the noise
@@ -25,6 +27,7 @@ _SIGMAS_OF_GROWTH = 8.0  # its change within a window, which a step ahead imitat
 _RARE = 0.01  # share of windows that say so in right recordings; one of the hundreds of a long one is no alarm
 _LARGEST_LENS_ERROR = 0.06  # of the logarithm of a focal length; a window that knows it less well says nothing of it
 _SUSPECTED = 0.75  # of the error that a segment may have, where something speaks against it that right ones show, too
+_NOT_KNOWN = 0.5  # of the logarithm of a scale: about half or double
 _AS_WELL = 1.8  # error of a camera that only turns, over the map's: 1.2 to 1.6 where it did, 9 to 24 where it moved
 _MOVED = 0.03  # of the picture's width; what moves less is explained by any camera
 RIGHT, DOUBTFUL, NOT_JUDGED = "right", "doubtful", "not judged"
@@ -85,7 +88,12 @@ def judge(
     alarms = (*alarms, *_said_of_turning(spread))
     error = estimated_error(spread)
     uncertain = _uncertain(spread)
-    limit = settings.max_error * _SUSPECTED ** (suspected if suspicions else 0)
+    times = suspected if suspicions else 0
+    first, last = spread.frames
+    if sum(b - a for a, b in uncertain) > LARGE_PART * (last - first) > 0:
+        suspicions = (*suspicions, "over a large part of it the scale is not determined")
+        times += 1
+    limit = settings.max_error * _SUSPECTED**times
     word = RIGHT if error <= limit and not alarms else DOUBTFUL
     if word == RIGHT:  # what speaks for it comes first
         evidence = [_in_words(spread, error), *(f"although {suspicion}" for suspicion in suspicions)]
@@ -93,6 +101,7 @@ def judge(
         evidence = [*alarms, *suspicions, _in_words(spread, error)]
     evidence += [words for words in of_lens[:1] if words not in alarms]
     evidence += [f"frames {first} to {last}: the scale is not determined" for first, last in uncertain]
+    evidence += [_said_of_leap(gap) for gap in spread.leaps]
     return Verdict(word, error, spread.noise_px, tuple(evidence), uncertain, float("nan") if alarms else limit)
 
 
@@ -148,14 +157,19 @@ def estimated_error(spread: Spread) -> float:
     noise = averaged * np.nan_to_num(spread.noise_px) / (_USUAL_NOISE * spread.width)
     shared = averaged * spread.shared_px / (_USUAL_SHARED * spread.width)
     quarters, halves = spread.error_percent[: len(QUARTERS)], spread.error_percent[len(QUARTERS) :]
-    scale = _SCALE_SHARE * float(_scale_errors(spread).max(initial=0.0))
+    scale = float(_moved_by_scale(spread).max(initial=0.0))
     spreads = (quarters**2).sum() + len(HALVES) * halves.min() ** 2 + scale**2
-    return float(max(noise, shared, 1.0) ** _NOISE_POWER * np.sqrt(spreads))
+    return float(_COVERAGE * max(noise, shared, 1.0) ** _NOISE_POWER * np.sqrt(spreads))
 
 
 def _scale_errors(spread: Spread) -> Float64:
     """(L,) how much the parts change the scale across each link, median of the absolute logarithms."""
     return np.asarray(np.median(np.abs(spread.scale_steps), axis=1), np.float64)
+
+
+def _moved_by_scale(spread: Spread) -> Float64:
+    """(L,) % of the path that the disagreement of the parts about the scale moves its positions, by each link."""
+    return np.asarray(_SCALE_FACTOR * spread.leverage * _scale_errors(spread), np.float64)
 
 
 def _said_of_lens(spread: Spread) -> tuple[str, ...]:
@@ -191,6 +205,12 @@ def _said_of_turning(spread: Spread) -> tuple[str, ...]:
     return (f"a camera that only turns, {fov:.0f} degrees wide, explains it as well, and how wide it is was a guess",)
 
 
+def _said_of_leap(gap: SeenAgain) -> str:
+    first, last = gap.frames
+    seen = f"{gap.found} of {gap.expected} points that should be are seen again"
+    return f"frames {first} to {last}: the place may only look like the one before, {seen}"
+
+
 def _told(first: int, last: int, words: str) -> str:
     return f"frames {first} to {last} fit best if the focal length {words}: a zoom, a wrong calibration, or a mover"
 
@@ -217,9 +237,12 @@ def _in_words(spread: Spread, error: float) -> str:
         words += f"the points are {spread.noise_px:.1f} pixels off, and "
     if spread.shared_px > 1.25 * _USUAL_SHARED * spread.width:
         words += f"parts of the picture are off by {spread.shared_px:.2f} pixels together, and "
-    scale = float(_scale_errors(spread).max(initial=0.0))
-    if _SCALE_SHARE * scale > float(np.linalg.norm(spread.error_percent)):
-        first, last = spread.link_frames[int(np.argmax(_scale_errors(spread)))].tolist()
+    moved = _moved_by_scale(spread)
+    if moved.max(initial=0.0) > float(np.linalg.norm(spread.error_percent)):
+        first, last = spread.link_frames[int(np.argmax(moved))].tolist()
+        scale = float(_scale_errors(spread)[int(np.argmax(moved))])
+        if scale >= _NOT_KNOWN:
+            return words + f"nothing tells the scale between frames {first} and {last}"
         share = f"{100 * scale:.1g}" if scale < 0.01 else f"{100 * scale:.0f}"
         only = " only" if scale >= SAME_SCALE else ""
         return words + f"the scale between frames {first} and {last} is known to {share} %{only}"
