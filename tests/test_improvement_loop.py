@@ -22,18 +22,11 @@ from rendered_walk import write_walk
 from improvement_example import SETTINGS, FakeTraining, run
 from improvo.errors import ConfigError, ImprovoError, InputError, OutputError
 from improvo.frontend.weights import load_weights
+from improvo.improvement.decision import rule, why_not_better
 from improvo.improvement.improve import Improvement
 from improvo.improvement.progress import ImprovementProgress
 from improvo.improvement.settings import ImproveSettings, ValidationSettings
-from improvo.improvement.validation import (
-    GapScores,
-    Validation,
-    gain,
-    read_validation,
-    rule,
-    summary,
-    why_not_better,
-)
+from improvo.improvement.validation import GapScores, Validation, gain, read_validation, summary
 from improvo.labeling.labeled import read_labels
 
 EXAMPLE = Path(__file__).with_name("improvement_example.py")
@@ -424,6 +417,31 @@ def test_better_is_more_right_matches_with_odometry_that_is_no_worse() -> None:
     assert not is_better(validation(more, segments=2), nothing, nothing, settings)
 
 
+def test_what_is_not_better_is_told_why() -> None:
+    settings = ValidationSettings()
+    start, best = validation([0.4, 0.5, 0.6] * 5), validation([0.5, 0.6, 0.7] * 5)
+    assert why_not_better(best, start, start, settings) == ""
+    neither = "neither number nor share of right matches is larger than at the start by more than chance"
+    for candidate, before, words in (
+        (start, start, neither),
+        (validation([0.6, 0.4, 0.52] * 5), start, neither),
+        (best, best, "number and share of right matches together are no larger than with the best round before"),
+        (validation([0.7, 0.8, 0.9] * 5, tracked=90), start, "fewer frames are tracked than at the start (100)"),
+        (
+            validation([0.7, 0.8, 0.9] * 5, segments=2, matches=50),
+            start,
+            "fewer of its matches are right than at the start, by more than chance; "
+            "the odometry breaks more often than at the start",
+        ),
+        (
+            validation([0.3, 0.4, 0.5] * 5, matches=200),
+            start,
+            "a smaller share of its matches is right than at the start, by more than chance",
+        ),
+    ):
+        assert why_not_better(candidate, before, start, settings) == words
+
+
 def test_more_right_matches_are_better_where_their_share_is_the_same_and_the_other_way_round() -> None:
     settings = ValidationSettings()
     start = validation([0.4, 0.5, 0.6] * 5)
@@ -432,34 +450,6 @@ def test_more_right_matches_are_better_where_their_share_is_the_same_and_the_oth
     assert not is_better(validation([0.39, 0.49, 0.59] * 5, matches=110), start, start, settings)  # a smaller share
     assert is_better(validation([0.408, 0.51, 0.612] * 5, matches=100), start, start, settings)
     assert not is_better(validation([0.41, 0.51, 0.61] * 5, matches=95), start, start, settings)  # fewer right ones
-
-
-def test_what_is_not_better_is_told_why() -> None:
-    settings = ValidationSettings()
-    start, best = validation([0.4, 0.5, 0.6] * 5), validation([0.5, 0.6, 0.7] * 5)
-    assert why_not_better(best, start, start, settings) == ""
-    for candidate, before, words in (
-        (start, start, "number and share of right matches together are no larger than at the start"),
-        (
-            validation([0.45, 0.55, 0.65] * 5),
-            best,
-            "number and share of right matches together are no larger than with the best round before; "
-            "fewer matches are right than with the best round before; "
-            "a smaller share of the matches is right than with the best round before",
-        ),
-        (
-            validation([0.6, 0.4, 0.52] * 5),
-            start,
-            "that right matches gained in number or share over the start may be chance",
-        ),
-        (validation([0.7, 0.8, 0.9] * 5, tracked=90), start, "fewer frames are tracked than at the start (100)"),
-        (
-            validation([0.7, 0.8, 0.9] * 5, segments=2, matches=60),
-            start,
-            "fewer matches are right than at the start; the odometry breaks more often than at the start",
-        ),
-    ):
-        assert why_not_better(candidate, before, start, settings) == words
 
 
 def test_a_later_round_is_better_by_its_sum_if_it_gains_more_than_chance_over_the_start() -> None:

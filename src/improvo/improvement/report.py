@@ -9,10 +9,11 @@ from pathlib import Path
 from improvo.errors import InputError
 from improvo.files import write_png
 from improvo.frontend.weights import load_weights
+from improvo.improvement.decision import rule, why_not_better
 from improvo.improvement.folder import Candidate
 from improvo.improvement.settings import ImproveSettings, ValidationSettings
 from improvo.improvement.split import Part, Split
-from improvo.improvement.validation import Validation, found, gain, gain_words, loose, rule, strict, why_not_better
+from improvo.improvement.validation import Validation, found, gain, gain_words, loose, strict
 from improvo.labeling.store import DONE, read_records
 from improvo.report.improvement_page import Measure, Round, write_improvement_page
 from improvo.sequences import open_sequence
@@ -184,24 +185,24 @@ def _verdict(
     control: tuple[Candidate, Validation] | None,
 ) -> str:
     start, how = validations[0], settings.validation
-    words = ""
+    lines = []
     if best:
-        words += f"Kept: {candidates[best].name}; against the start, all gaps together: "
-        words += f"{gain_words(validations[best], start, how.matches)}."
+        gained = gain_words(validations[best], start, how.matches)
+        lines.append(f"Kept: {candidates[best].name}; against the start: {gained}.")
     elif len(candidates) > 1:
-        words += "No round was better than the start: the weights kept are those at the start, unchanged."
+        lines.append("No round was better than the start: the weights kept are those at the start, unchanged.")
     before = start
     for candidate, validation in zip(candidates[1:], validations[1:], strict=True):
         faults = why_not_better(validation, before, start, how)
         if faults:
-            words += (
-                f" {candidate.name.capitalize()} is not kept ({faults}): {gain_words(validation, start, how.matches)}."
-            )
+            gained = gain_words(validation, start, how.matches)
+            lines.append(f"{candidate.name.capitalize()} is not kept: {faults}. Against the start: {gained}.")
         before = before if faults else validation
     if control:
-        words += " The control, trained for as many rounds and steps on the same frames by homographies alone: "
-        words += f"{gain_words(control[1], start, how.matches)}."
-    return f"{words} {rule(how, bool(start.earlier))}".strip()
+        gained = gain_words(control[1], start, how.matches)
+        words = "The control, trained for as many rounds and steps on the same frames by homographies alone"
+        lines.append(f"{words}: {gained}.")
+    return "\n".join([*lines, rule(how, bool(start.earlier))])
 
 
 def _notes(
@@ -220,7 +221,7 @@ def _notes(
             notes.append(
                 f"Only {start.pairs(level)} pairs of frames held back are {start.gap_words(level)} apart, and all look "
                 "at much the same: believe little of what is said of them. Hold back more, with --evaluate or "
-                "--set split.share=0.33."
+                "--set split.share=0.33 in another folder."
             )
     notes += [f"Left out: {reason}" for reason in split.unusable]
     for candidate, validation in zip(candidates, validations, strict=True):
