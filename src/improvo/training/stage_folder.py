@@ -22,7 +22,7 @@ from improvo.training.distributed import Process
 from improvo.training.held_settings import HeldSettings
 from improvo.training.metrics import METRICS, read_metrics
 from improvo.training.settings import HomographiesSettings, OdometryTrainingSettings, ShapesSettings
-from improvo.training.stage import Stage
+from improvo.training.stages.base import Stage
 from improvo.training.trainer import Batches, Trainer
 
 WEIGHTS = "weights.safetensors"

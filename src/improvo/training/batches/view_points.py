@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from improvo.frontend.architecture import CELL
-from improvo.training.labels import DUSTBIN
-from improvo.training.picture_store import on_device
+from improvo.training.data.point_labels import DUSTBIN
+from improvo.training.device import on_device
 from improvo.types import Float64
 
 FAR = -1e6  # pixels, in place of a place that no picture shows: behind the camera, or beyond the horizon

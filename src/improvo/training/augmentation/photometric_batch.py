@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from improvo.training.picture_store import on_device
+from improvo.training.device import on_device
 from improvo.training.settings import PhotometricSettings
 
 _RADIUS = 4  # pixels of the blur kernels

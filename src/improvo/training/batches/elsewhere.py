@@ -12,16 +12,16 @@ from torch import Tensor
 from improvo.frontend.superpoint import sample_descriptors
 from improvo.frontend.weights import DataSource, Weights
 from improvo.sequences.images import read_grey
+from improvo.training.batches.picture_store import PictureStore
+from improvo.training.batches.teacher import network_teacher
+from improvo.training.batches.view_points import cell_keypoints
+from improvo.training.batches.whole_frames import WholeFrames
 from improvo.training.distributed import Process
 from improvo.training.held_settings import HeldSettings
-from improvo.training.picture_store import PictureStore
-from improvo.training.teacher import network_teacher
 from improvo.training.trainer import Batches
-from improvo.training.view_points import cell_keypoints
-from improvo.training.whole_frames import WholeFrames
 from improvo.types import UInt8
 
-_BUNDLED = Path(__file__).parent / "bundled" / "elsewhere"
+_BUNDLED = Path(__file__).parents[1] / "bundled" / "elsewhere"
 BUNDLED_SOURCE = DataSource("bundled pictures of other places (Poly Haven)", "CC0 1.0")
 
 

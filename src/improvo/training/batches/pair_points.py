@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from improvo.frontend.architecture import CELL
-from improvo.training.alignment import aligned
+from improvo.training.batches.alignment import aligned
+from improvo.training.batches.picture_store import MaskStore, PictureStore
+from improvo.training.batches.posed_frames import Carried, PosedFrames
+from improvo.training.batches.view_points import cell_corners, cell_keypoints, warped, within
+from improvo.training.device import on_device
 from improvo.training.held_settings import HeldSettings
-from improvo.training.picture_store import MaskStore, PictureStore, on_device
-from improvo.training.posed_frames import Carried, PosedFrames
-from improvo.training.view_points import cell_corners, cell_keypoints, warped, within
 from improvo.types import Float64, Int64
 
 _SPREAD = 1.0  # of the random part of a keypoint's score, beside the logarithm of its probability

@@ -1,6 +1,6 @@
 """A labeled sequence by frames: the points that a frame shows, and where another frame shows the same ones.
 
-Correspondences are of landmarks (`improvo.training.landmarks`).
+Correspondences are of landmarks (`improvo.training.data.landmarks`).
 Beyond the paper, a stable landmark is also known in frames where no track observed it, if its projection is visible.
 """
 
@@ -16,7 +16,7 @@ from improvo.frontend.masking import unmasked
 from improvo.geometry.se3 import transform
 from improvo.labeling.labeled import LabeledSequence
 from improvo.stability.rule import STABLE
-from improvo.training.landmarks import Codes, Landmarks, Summary, find_landmarks
+from improvo.training.data.landmarks import Codes, Landmarks, Summary, find_landmarks
 from improvo.training.settings import LandmarkSettings
 from improvo.types import Float64, Int64, Mask, UInt8
 

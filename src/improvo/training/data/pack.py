@@ -18,8 +18,8 @@ from improvo.files import written_atomically
 from improvo.frontend.weights import DataSource
 from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.images import decode
-from improvo.training.pictures import Pictures, Source
-from improvo.training.posed import PosedSequence
+from improvo.training.data.pictures import Pictures, Source
+from improvo.training.data.posed_sequence import PosedSequence
 from improvo.types import Float32, Mask, UInt8
 from improvo.untrusted.arrays import FAULTS
 from improvo.untrusted.text import load_json, reason

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from improvo.geometry import se3
+from improvo.training.batches.picture_store import PictureStore
+from improvo.training.batches.posed_frames import PosedFrames
 from improvo.training.held_settings import AlignmentSettings
-from improvo.training.picture_store import PictureStore
-from improvo.training.posed_frames import PosedFrames
 from improvo.types import Float64, Int64
 
 _LARGEST_STEP = 2.0  # pixels of the level

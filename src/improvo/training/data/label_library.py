@@ -14,10 +14,10 @@ from typing import Any
 
 from improvo.jobs.pool import Workers
 from improvo.labeling.labeled import LabeledSequence
+from improvo.training.data.labeled_frames import LabeledFrames
+from improvo.training.data.landmark_files import LandmarkFiles
+from improvo.training.data.landmarks import Summary
 from improvo.training.distributed import Process
-from improvo.training.labeled_frames import LabeledFrames
-from improvo.training.landmark_files import LandmarkFiles
-from improvo.training.landmarks import Summary
 from improvo.training.settings import LandmarkSettings
 
 SPARE = "landmarks"  # folder beside the weights, for label stores that cannot be written

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from improvo.frontend.superpoint import SuperPoint
-from improvo.training.losses import detector_loss
+from improvo.training.augmentation.views import cell_centres
 from improvo.training.settings import DetectorLossSettings, HomographiesSettings
-from improvo.training.stage import DescriptorStage, Stage
-from improvo.training.views import cell_centres
+from improvo.training.stages.base import DescriptorStage, Stage
+from improvo.training.stages.losses import detector_loss
 
 
 class MagicPointStage(Stage):

@@ -23,7 +23,7 @@ from improvo.labeling.labeled import LabeledSequence
 from improvo.locations import size_of
 from improvo.stability.rule import STABILITY_NAMES
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE
-from improvo.training.landmarks import Landmarks, Summary, find_landmarks
+from improvo.training.data.landmarks import Landmarks, Summary, find_landmarks
 from improvo.training.settings import LandmarkSettings
 from improvo.untrusted.text import load_json
 

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from improvo.frontend.masking import unmasked
 from improvo.stability.rule import STABLE, UNSTABLE
-from improvo.training.label_library import LabelLibrary
-from improvo.training.labeled_frames import FramePoints, LabeledFrames, common_points
-from improvo.training.labels import DUSTBIN, IGNORED, label_cells
-from improvo.training.pairs import PairBatches, View
-from improvo.training.photometric import augment
-from improvo.training.seeded_batches import Batch, SeededBatches
+from improvo.training.augmentation.photometric import augment
+from improvo.training.augmentation.views import inside, random_view, warp_image, warp_points
+from improvo.training.batches.homography_pairs import PairBatches, View
+from improvo.training.batches.seeded import Batch, SeededBatches
+from improvo.training.data.label_library import LabelLibrary
+from improvo.training.data.labeled_frames import FramePoints, LabeledFrames, common_points
+from improvo.training.data.point_labels import DUSTBIN, IGNORED, label_cells
 from improvo.training.settings import AdaptationSettings, OdometryTrainingSettings
-from improvo.training.views import inside, random_view, warp_image, warp_points
 from improvo.types import Float32, Float64, Int64, UInt8
 
 _CERTAIN, _UNDECIDED = 1.0, 0.2  # agreement of labels as `label_cells` takes it, on either side of `accepted`

@@ -14,8 +14,8 @@ from improvo.geometry.camera import Camera
 from improvo.labeling.labeled import LabeledSequence
 from improvo.stability.grouping import medians, rows_of
 from improvo.stability.rule import IGNORE, STABLE, UNSTABLE
+from improvo.training.data.wrong_links import largest_step_shares
 from improvo.training.settings import LandmarkSettings
-from improvo.training.wrong_links import largest_step_shares
 from improvo.types import Float32, Float64, Int64
 
 Codes = NDArray[np.int8]

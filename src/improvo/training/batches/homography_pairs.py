@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from improvo.training.labels import PointLabels, label_cells
-from improvo.training.photometric import augment
-from improvo.training.pictures import Pictures
-from improvo.training.seeded_batches import Batch, SeededBatches
+from improvo.training.augmentation.photometric import augment
+from improvo.training.augmentation.views import cell_centres, inside, random_view, warp_image, warp_points
+from improvo.training.batches.seeded import Batch, SeededBatches
+from improvo.training.data.pictures import Pictures
+from improvo.training.data.point_labels import PointLabels, label_cells
 from improvo.training.settings import HINGE, HomographiesSettings
-from improvo.training.views import cell_centres, inside, random_view, warp_image, warp_points
 from improvo.types import Float32, Float64, Int64, UInt8
 
 

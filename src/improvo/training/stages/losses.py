@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from improvo.frontend.architecture import CELL
-from improvo.training.labels import DUSTBIN, IGNORED
+from improvo.training.data.point_labels import DUSTBIN, IGNORED
 from improvo.training.settings import DetectorLossSettings
 from improvo.training.shared_statistics import share_of_count
 

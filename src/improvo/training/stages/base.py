@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from improvo.frontend.superpoint import SuperPoint, sample_descriptors
-from improvo.training.losses import hinge_loss, info_nce_loss
 from improvo.training.settings import HINGE
+from improvo.training.stages.losses import hinge_loss, info_nce_loss
 
 
 class Stage(nn.Module):

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from improvo.frontend.architecture import CELL
-from improvo.training.picture_store import PictureStore
+from improvo.training.batches.picture_store import PictureStore
 from improvo.types import Int64
 
 

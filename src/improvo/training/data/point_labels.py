@@ -10,8 +10,8 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.files import written_atomically
+from improvo.training.augmentation.views import inside, warp_points
 from improvo.training.settings import AdaptationSettings
-from improvo.training.views import inside, warp_points
 from improvo.types import Float32, Float64, Int64
 from improvo.untrusted.arrays import read_npz
 from improvo.untrusted.limits import MAX_TABLE_BYTES

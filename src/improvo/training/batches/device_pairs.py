@@ -9,18 +9,19 @@ import torch
 from torch import Tensor
 
 from improvo.errors import InputError
+from improvo.training.augmentation.photometric_batch import augment_batch
+from improvo.training.augmentation.views import inside, warp_points
+from improvo.training.augmentation.views_batch import random_views
+from improvo.training.batches.pair_points import PairPlan, PairPoints
+from improvo.training.batches.picture_store import MaskStore, PictureStore
+from improvo.training.batches.posed_frames import PosedFrames
+from improvo.training.batches.teacher import Teacher
+from improvo.training.batches.whole_frames import WholeFrames
+from improvo.training.data.pictures import Pictures, Source
+from improvo.training.data.posed_sequence import PosedSequence, overlapping_pairs
+from improvo.training.device import on_device
 from improvo.training.distributed import Process
 from improvo.training.held_settings import HeldSettings
-from improvo.training.pair_points import PairPlan, PairPoints
-from improvo.training.photometric_batch import augment_batch
-from improvo.training.picture_store import MaskStore, PictureStore, on_device
-from improvo.training.pictures import Pictures, Source
-from improvo.training.posed import PosedSequence, overlapping_pairs
-from improvo.training.posed_frames import PosedFrames
-from improvo.training.random_views import random_views
-from improvo.training.teacher import Teacher
-from improvo.training.views import inside, warp_points
-from improvo.training.whole_frames import WholeFrames
 from improvo.types import Float64, Int64
 
 

@@ -7,9 +7,9 @@ from torch import Tensor, nn
 
 from improvo.errors import ConfigError
 from improvo.frontend.superpoint import SuperPoint, sample_stability
-from improvo.training.losses import detector_loss, stability_loss
 from improvo.training.settings import OdometryTrainingSettings
-from improvo.training.stage import DescriptorStage
+from improvo.training.stages.base import DescriptorStage
+from improvo.training.stages.losses import detector_loss, stability_loss
 
 
 class VOAdaptationStage(DescriptorStage):

@@ -11,8 +11,8 @@ from torch.nn import functional
 
 from improvo.frontend.superpoint import SuperPoint, sample_descriptors
 from improvo.training.held_settings import HeldSettings
-from improvo.training.losses import held_loss, info_nce_loss
-from improvo.training.stage import Stage
+from improvo.training.stages.base import Stage
+from improvo.training.stages.losses import held_loss, info_nce_loss
 
 
 class HeldStage(Stage):

@@ -15,10 +15,10 @@ from torch.nn import functional
 
 from improvo import terminal
 from improvo.frontend.superpoint import SuperPoint, heat_map
-from improvo.training.labels import Consensus, PointLabels
-from improvo.training.pictures import Pictures
+from improvo.training.augmentation.views import random_view, warp_image
+from improvo.training.data.pictures import Pictures
+from improvo.training.data.point_labels import Consensus, PointLabels
 from improvo.training.settings import AdaptationSettings, ViewSettings
-from improvo.training.views import random_view, warp_image
 from improvo.types import Float32, Float64, UInt8
 
 # picture (H, W), homographies (V, 3, 3) picture to view, view size (width, height) -> keypoints (N, 2) of each view

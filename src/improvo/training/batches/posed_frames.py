@@ -9,9 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from improvo.training.picture_store import DepthStore, on_device
-from improvo.training.posed import PosedSequence
-from improvo.training.view_points import FAR
+from improvo.training.batches.picture_store import DepthStore
+from improvo.training.batches.view_points import FAR
+from improvo.training.data.posed_sequence import PosedSequence
+from improvo.training.device import on_device
 from improvo.types import Float64, Int64
 
 _SIDE = 3.0  # pixels from a place to those that tell how the surface about it is seen

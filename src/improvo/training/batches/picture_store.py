@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from improvo.training.device import on_device
 from improvo.types import Float32, Float64, Int64, Mask, UInt8
 
 _REDUCED_ABOVE = 1.5  # pixels of the picture per pixel of the view from which on the halved picture is looked at
@@ -167,12 +166,6 @@ class DepthStore:
         least, most = corners.amin(dim=0), corners.amax(dim=0)
         smooth = within & (least > 0) & (most < 1.15 * least)
         return torch.where(smooth, torch.lerp(upper, lower, down), 0.0)
-
-
-def on_device(values: NDArray[Any], device: torch.device) -> Tensor:
-    """A small array as float32, or int64 where it holds whole numbers, without waiting for what the device does."""
-    kind = np.int64 if np.issubdtype(values.dtype, np.integer) else np.float32
-    return torch.from_numpy(np.ascontiguousarray(values, kind)).to(device, non_blocking=True)
 
 
 def _quartered(mask: Mask) -> Float32:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from improvo.training.device_pairs import DevicePairs
+from improvo.training.batches.device_pairs import DevicePairs
+from improvo.training.batches.tracked_pairs import TrackedPairs
 from improvo.training.held_settings import HeldSettings
 from improvo.training.settings import OdometryTrainingSettings, PairSettings
-from improvo.training.tracked_pairs import TrackedPairs
 
 
 class MixedPairs:

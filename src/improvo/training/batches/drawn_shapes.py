@@ -5,13 +5,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from improvo.training.labels import PointLabels, label_cells
-from improvo.training.photometric import augment
-from improvo.training.pictures import Source
-from improvo.training.seeded_batches import Batch, SeededBatches
+from improvo.training.augmentation.photometric import augment
+from improvo.training.augmentation.views import random_view, warp_image, warp_points
+from improvo.training.batches.seeded import Batch, SeededBatches
+from improvo.training.data.pictures import Source
+from improvo.training.data.point_labels import PointLabels, label_cells
+from improvo.training.data.shapes import FAMILIES, draw_shape
 from improvo.training.settings import AdaptationSettings, ShapesSettings
-from improvo.training.shapes import FAMILIES, draw_shape
-from improvo.training.views import random_view, warp_image, warp_points
 
 SIZE = (320, 240)  # width, height of the drawn pictures
 _EXACT = AdaptationSettings()  # a drawn corner is a label whatever share of views would be asked for
