@@ -8,7 +8,7 @@ from simulated_features import CAMERA, hand_motion, observe, room, views_of
 
 from improvo.backend.settings import ObjectiveSettings, SolverSettings
 from improvo.geometry import se3
-from improvo.odometry.mapping.window import adjust
+from improvo.odometry.mapping.bundle_adjustment import adjust
 from improvo.odometry.view import PointStore, View
 
 OBJECTIVE = ObjectiveSettings(depth_weight=0.0)
