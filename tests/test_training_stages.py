@@ -286,7 +286,7 @@ def test_a_finished_folder_is_left_as_it_is_and_other_settings_are_refused(
     assert (tmp_path / "shapes" / "weights.safetensors").read_bytes() == weights
     capsys.readouterr()
     assert main([*command, "--seed", "4"]) == 2
-    assert "optimiser.seed" in capsys.readouterr().err
+    assert "was begun with --seed 0, now with --seed 4" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
