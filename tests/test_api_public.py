@@ -85,6 +85,9 @@ def test_the_reference_has_every_public_name() -> None:
         found: Any = getattr(improvo, name)
         module, own = found.__module__, found.__name__
         assert {module, f"{module}.{own}"} & (whole | listed), f"{name} ({place}): is not in docs/reference.md"
+    verbs = [getattr(improvo, name) for name, place in improvo._PUBLIC.items() if place == "improvo.verbs"]
+    for returned in {name for verb in verbs for name in re.findall(r"[A-Z]\w+", verb.__annotations__["return"])}:
+        assert re.search(rf"\b{returned}\b", text), f"{returned}: is not in docs/reference.md"
 
 
 def test_import_is_light() -> None:

@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -288,3 +289,15 @@ def test_bash_completes_commands_options_and_choices(tmp_path: Path, capsys: pyt
         )
         found = subprocess.run([bash, "-c", program], capture_output=True, text=True, check=True).stdout.split()
         assert expected in found, (line, found)
+
+
+def test_waiting_threads_give_the_processor_back_unless_the_user_says_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for given, policy in ((None, "PASSIVE"), ("ACTIVE", "ACTIVE")):
+        monkeypatch.setenv("OMP_WAIT_POLICY", given or "")
+        if given is None:
+            monkeypatch.delenv("OMP_WAIT_POLICY")
+        with pytest.raises(SystemExit):
+            main(["--version"])
+        assert os.environ["OMP_WAIT_POLICY"] == policy

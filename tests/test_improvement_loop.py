@@ -22,10 +22,11 @@ from rendered_walk import write_walk
 from improvement_example import SETTINGS, FakeTraining, run
 from improvo.errors import ConfigError, ImprovoError, InputError, OutputError
 from improvo.frontend.weights import load_weights
+from improvo.improvement.decision import rule, why_not_better
 from improvo.improvement.improve import Improvement
 from improvo.improvement.progress import ImprovementProgress
 from improvo.improvement.settings import ImproveSettings, ValidationSettings
-from improvo.improvement.validation import GapScores, Validation, gain, is_better, read_validation, rule, summary
+from improvo.improvement.validation import GapScores, Validation, gain, read_validation, summary
 from improvo.labeling.labeled import read_labels
 
 EXAMPLE = Path(__file__).with_name("improvement_example.py")
@@ -104,7 +105,7 @@ def test_the_best_weights_are_kept_and_the_report_is_there(
     assert "Kept: round 1; " in page
     assert page.count("data:image/png") == 4  # matches and labels of the start and of the best
     assert any(line.startswith("round 1: ") and line.endswith("better, kept") for line in lines)
-    assert any(line.startswith("round 2: ") and line.endswith("not better, not kept") for line in lines)
+    assert any(line.startswith("round 2: ") and line.endswith("), not kept") for line in lines)
 
 
 def test_no_better_round_leaves_the_start_and_says_so(walk: Path, tmp_path: Path) -> None:
@@ -186,8 +187,8 @@ def test_the_control_is_judged_like_a_round_and_never_kept(walk: Path, tmp_path:
 def test_the_control_has_as_many_rounds_and_steps_as_what_is_kept(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    verdicts = iter([True, True, False])
-    monkeypatch.setattr("improvo.improvement.improve.is_better", lambda *_: next(verdicts))
+    verdicts = iter(["", "", "a fault"])
+    monkeypatch.setattr("improvo.improvement.improve.why_not_better", lambda *_: next(verdicts))
     training, out = FakeTraining((0.0,)), tmp_path / "out"
     settings = replace(SETTINGS, control=True)
     result = run(out, [walk], training, rounds=3, settings=settings)
@@ -391,6 +392,10 @@ def validation(right: list[float], tracked: int = 100, segments: int = 1, matche
     return Validation(100, tracked, segments, 8.0, 0.8, 0.5, {}, (scores,))
 
 
+def is_better(candidate: Validation, best: Validation, start: Validation, settings: ValidationSettings) -> bool:
+    return not why_not_better(candidate, best, start, settings)
+
+
 def test_better_is_more_right_matches_with_odometry_that_is_no_worse() -> None:
     settings = ValidationSettings()
     start = validation([0.4, 0.5, 0.6] * 5)
@@ -410,6 +415,31 @@ def test_better_is_more_right_matches_with_odometry_that_is_no_worse() -> None:
     nothing = validation([0.4, 0.5, 0.6] * 5, tracked=0, segments=0)
     assert is_better(validation(more), nothing, nothing, settings)  # one segment is no break more than none
     assert not is_better(validation(more, segments=2), nothing, nothing, settings)
+
+
+def test_what_is_not_better_is_told_why() -> None:
+    settings = ValidationSettings()
+    start, best = validation([0.4, 0.5, 0.6] * 5), validation([0.5, 0.6, 0.7] * 5)
+    assert why_not_better(best, start, start, settings) == ""
+    neither = "neither number nor share of right matches is larger than at the start by more than chance"
+    for candidate, before, words in (
+        (start, start, neither),
+        (validation([0.6, 0.4, 0.52] * 5), start, neither),
+        (best, best, "number and share of right matches together are no larger than with the best round before"),
+        (validation([0.7, 0.8, 0.9] * 5, tracked=90), start, "fewer frames are tracked than at the start (100)"),
+        (
+            validation([0.7, 0.8, 0.9] * 5, segments=2, matches=50),
+            start,
+            "fewer of its matches are right than at the start, by more than chance; "
+            "the odometry breaks more often than at the start",
+        ),
+        (
+            validation([0.3, 0.4, 0.5] * 5, matches=200),
+            start,
+            "a smaller share of its matches is right than at the start, by more than chance",
+        ),
+    ):
+        assert why_not_better(candidate, before, start, settings) == words
 
 
 def test_more_right_matches_are_better_where_their_share_is_the_same_and_the_other_way_round() -> None:

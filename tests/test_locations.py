@@ -21,7 +21,7 @@ from improvo.frontend.settings import FrontendSettings
 from improvo.labeling import label_sequences as label_module
 from improvo.labeling.label_sequences import LabelJob, label_sequence
 from improvo.labeling.labeled import read_labels
-from improvo.locations import claim, fetched, is_remote, local_folder, place, publish, with_urls
+from improvo.locations import claim, fetched, local_folder, place, publish, with_urls
 from improvo.odometry.run_settings import LabelRunSettings
 from improvo.stability.settings import LabelQualitySettings, LabelSettings
 from labeled_scene import write_labeled_scene
@@ -36,8 +36,7 @@ ORB += ["--set", "labels.quality.enabled=false", "--pack"]
 def test_paths_of_this_machine_stay_what_they_are(tmp_path: Path) -> None:
     assert local_folder("out/labels") == Path("out/labels")
     assert local_folder(f"file://{tmp_path}/labels") == tmp_path / "labels"
-    assert not is_remote("C:/video")
-    assert is_remote("s3://bucket/labels")
+    assert local_folder("C:/video") == Path("C:/video")
     assert with_urls(str(tmp_path)) == str(tmp_path)
 
 

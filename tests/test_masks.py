@@ -10,10 +10,9 @@ import pytest
 
 from improvo.cli.main import main
 from improvo.errors import InputError
-from improvo.frontend.decoding import decode
+from improvo.frontend.decoding import NetworkMaps, decode
 from improvo.frontend.masking import features_of
 from improvo.frontend.registry import load_frontend
-from improvo.frontend.runtime import NetworkMaps
 from improvo.frontend.settings import NetworkSettings
 from improvo.geometry.camera import Camera
 from improvo.geometry.camera_files import calibration_yaml

@@ -12,7 +12,7 @@ from improvo.geometry import se3
 from improvo.geometry.a_contrario import disc_probability, log10_false_alarms
 from improvo.geometry.alignment import Similarity
 from improvo.odometry.mapping.bridging import Bridging, Join
-from improvo.odometry.mapping.course import Course
+from improvo.odometry.mapping.camera_path import CameraPath
 from improvo.odometry.mapping.former_map import Sighting
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import BridgingSettings, OdometrySettings
@@ -82,25 +82,25 @@ def test_a_place_that_cannot_be_reached_within_the_gap_only_looks_the_same(
     ],
 )
 def test_what_a_camera_can_reach(frame: int, seconds: float, place: float, leaps: bool) -> None:
-    def course(first: int, start: float, x: float) -> Course:
+    def path(first: int, start: float, x: float) -> CameraPath:
         steps = np.arange(5.0)
-        return Course(
+        return CameraPath(
             np.stack([first + steps, start + 0.1 * steps], axis=1), np.outer(x + 0.4 * steps, [1.0, 0.0, 0.0])
         )
 
-    before = course(6, 0.6, -1.6)  # ends with frame 10, after a second, at zero
-    assert course(frame, seconds, place).is_leap_from(before, slack=0.5) == leaps
+    before = path(6, 0.6, -1.6)  # ends with frame 10, after a second, at zero
+    assert path(frame, seconds, place).is_leap_from(before, slack=0.5) == leaps
 
 
-def test_a_course_in_another_world() -> None:
-    course = Course(np.array([[0.0, 0.0], [2.0, 0.2]]), np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
-    np.testing.assert_allclose(course.fastest, [0.5, 5.0])
-    np.testing.assert_allclose(course.placed(Similarity(3.0, np.eye(3), np.ones(3))).centers, [[1, 1, 1], [4, 1, 1]])
-    alone = Course(np.zeros((1, 2)), np.zeros((1, 3)))
+def test_a_path_in_another_world() -> None:
+    path = CameraPath(np.array([[0.0, 0.0], [2.0, 0.2]]), np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(path.fastest, [0.5, 5.0])
+    np.testing.assert_allclose(path.placed(Similarity(3.0, np.eye(3), np.ones(3))).centers, [[1, 1, 1], [4, 1, 1]])
+    alone = CameraPath(np.zeros((1, 2)), np.zeros((1, 3)))
     np.testing.assert_array_equal(alone.fastest, [0.0, 0.0])
-    nothing = Course(np.zeros((0, 2)), np.zeros((0, 3)))
-    assert not nothing.is_leap_from(course, 0.0)
-    assert not course.is_leap_from(nothing, 0.0)
+    nothing = CameraPath(np.zeros((0, 2)), np.zeros((0, 3)))
+    assert not nothing.is_leap_from(path, 0.0)
+    assert not path.is_leap_from(nothing, 0.0)
 
 
 def test_without_bridging_it_begins_another_segment() -> None:
@@ -157,7 +157,9 @@ class ScriptedMap:
 
     def __init__(self, scales: list[float | None]) -> None:
         self._scales = iter(scales)
-        self.course = Course(np.array([[49.0, 1.63], [50.0, 1.66]]), np.array([[-0.05, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+        self.camera_path = CameraPath(
+            np.array([[49.0, 1.63], [50.0, 1.66]]), np.array([[-0.05, 0.0, 0.0], [0.0, 0.0, 0.0]])
+        )
 
     def sighting(self, view: View, xyz: Float64) -> Sighting | None:
         scale = next(self._scales)

@@ -11,8 +11,7 @@ from simulated_features import CAMERA, error_percent, hand_motion, nothing_to_se
 
 from improvo.geometry import se3
 from improvo.odometry.settings import OdometrySettings, RansacGateSettings
-from improvo.odometry.trajectory_builder import FinalView
-from improvo.odometry.view import View
+from improvo.odometry.view import FinalView, View
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.types import Features, Float64
 

@@ -13,8 +13,7 @@ from improvo.geometry import se3
 from improvo.odometry import paper
 from improvo.odometry.settings import PAPER, OdometrySettings
 from improvo.odometry.states import TrackingState
-from improvo.odometry.trajectory_builder import FinalView
-from improvo.odometry.view import View
+from improvo.odometry.view import FinalView, View
 from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
 from improvo.types import Features, Float64
 
@@ -160,7 +159,7 @@ def test_evidence_against_one_segment_does_not_count_against_the_next(
             self._seen += 1
             return self._seen >= 15
 
-    monkeypatch.setattr(paper, "HealthCheck", Check)
+    monkeypatch.setattr(paper, "TwoViewCheck", Check)
     odometry, _, _ = tracked([*seen[:10], nothing_to_see(1), *seen[10:20]])
     assert len(odometry.segments) == 3
     assert not any(event.kind == "contradiction" for event in odometry.events)

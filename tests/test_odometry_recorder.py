@@ -12,7 +12,7 @@ from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.odometry import recorder
 from improvo.odometry.recorder import TrackRecorder
-from improvo.odometry.trajectory_builder import FinalView
+from improvo.odometry.view import FinalView
 from improvo.stability.rule import label_stability
 from improvo.stability.settings import LabelSettings
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, read_points, read_tracks

@@ -15,9 +15,9 @@ from improvo.odometry.map_builder import MapBuilder
 from improvo.odometry.mapping.window import WindowReport
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.segments import Segment, SegmentPlacement
-from improvo.odometry.trajectory_builder import FinalView, TrajectoryBuilder
+from improvo.odometry.trajectory_builder import TrajectoryBuilder
 from improvo.odometry.verdict.verdict import DOUBTFUL, RIGHT, Verdict
-from improvo.odometry.view import View
+from improvo.odometry.view import FinalView, View
 from improvo.types import Float64
 
 POINTS = np.array([[0.0, 0.0, 2.0], [0.2, 0.1, 2.0], [-0.3, 0.2, 4.0]])

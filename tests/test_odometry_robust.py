@@ -10,13 +10,12 @@ import pytest
 from simulated_features import CAMERA, error_percent, hand_motion, nothing_to_see, observe, room
 
 from improvo.odometry import robust
-from improvo.odometry.alarms import second_map
-from improvo.odometry.alarms.second_map import SecondOpinion
+from improvo.odometry.alarms import second_opinion
+from improvo.odometry.alarms.second_opinion import SecondOpinion
 from improvo.odometry.mapping.initial_pair import InitFailure
 from improvo.odometry.settings import BridgingSettings, OdometrySettings
 from improvo.odometry.states import TrackingState
-from improvo.odometry.trajectory_builder import FinalView
-from improvo.odometry.view import View
+from improvo.odometry.view import FinalView, View
 from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
 from improvo.types import Features
 
@@ -81,7 +80,7 @@ def contradicts_at(monkeypatch: pytest.MonkeyPatch, *frame_indices: int, stands:
             left.remove(view.frame_index)
             return True
 
-    monkeypatch.setattr(robust, "HealthCheck", Check)
+    monkeypatch.setattr(robust, "TwoViewCheck", Check)
 
 
 def test_a_map_of_a_long_start_is_checked_before_it_is_trusted() -> None:
@@ -136,7 +135,7 @@ def test_a_contradicted_provisional_map_starts_anew_over_all_its_frames(monkeypa
 
 def test_a_map_that_starts_anew_with_other_poses_is_an_alarm(monkeypatch: pytest.MonkeyPatch) -> None:
     contradicts_at(monkeypatch, 45)
-    monkeypatch.setattr(second_map, "same_poses", lambda *_: False)
+    monkeypatch.setattr(second_opinion, "same_poses", lambda *_: False)
     run = Run(walk(60))
     assert [event.kind for event in run.odometry.events if event.frame_index == 45] == ["contradiction"]
 
@@ -186,7 +185,7 @@ def test_each_contradicted_map_of_the_same_frames_speaks_against_the_next(monkey
     contradicts_at(monkeypatch, 30, 45)
     assert not any("former map" in words for words in Run(walk(60)).odometry.segments[0].verdict.evidence)
     contradicts_at(monkeypatch, 30, 45)
-    monkeypatch.setattr(second_map, "same_poses", lambda *_: False)
+    monkeypatch.setattr(second_opinion, "same_poses", lambda *_: False)
     twice = Run(walk(60)).odometry.segments[0].verdict.evidence
     words = "each of 2 former maps of these frames was contradicted by two-view geometry"
     assert f"although {words}" in twice

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -130,3 +133,24 @@ def test_no_tracks():
 def test_impossible_settings_are_refused(values):
     with pytest.raises(ConfigError):
         LabelSettings(**values)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda tracks, poses, segment, K: (tracks_of(tracks, slice(None, None, -1)), poses, segment, K), "sorted"),
+        (lambda tracks, poses, segment, K: (tracks_of(tracks, [0, 0, 1]), poses, segment, K), "each frame once"),
+        (lambda tracks, poses, segment, K: (tracks, poses[:3], segment[:3], K), r"outside 0\.\.2 of cam_from_world"),
+        (lambda tracks, poses, segment, K: (tracks, poses, segment[:3], K), "segment: shape"),
+        (lambda tracks, poses, segment, K: (tracks, poses[:, :3], segment, K), "cam_from_world: shape"),
+        (lambda tracks, poses, segment, K: (tracks, poses, segment, K[:2]), "K: shape"),
+        (lambda tracks, *rest: (replace(tracks, keypoints=tracks.keypoints[:-1]), *rest), "tracks.keypoints: shape"),
+    ],
+)
+def test_arrays_that_would_give_wrong_labels_are_refused(change: Any, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        label_stability(*change(*simulated_tracks()))
+
+
+def tracks_of(tracks: Tracks, rows: Any) -> Tracks:
+    return Tracks(tracks.frame[rows], tracks.track[rows], tracks.keypoints[rows], tracks.weight[rows])

@@ -15,7 +15,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 UInt8 = NDArray[np.uint8]
-Mask = NDArray[np.bool_]  # (H, W) True where a picture is used
+Mask = NDArray[np.bool_]  # which rows (N,), or which pixels (H, W) of a picture are used
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,10 @@ class Features:
         """The features of the given rows (indices or mask), in that order."""
         stability = None if self.stability is None else self.stability[rows]
         return Features(self.keypoints[rows], self.descriptors[rows], self.scores[rows], stability)
+
+    def best(self, count: int) -> Features:
+        """The `count` features of the highest score, or all, best first; of equal scores the earlier comes first."""
+        return self.take(np.argsort(-self.scores, kind="stable")[:count])
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
-"""What the commands do, as functions: each opens its input, calls one room, and returns a typed result.
+"""The verbs of the Python API: what the commands do, as functions that return a typed result and print nothing.
 
-Nothing is printed. Heavy libraries load when a verb is called.
+Each opens its input and calls the room that does the work. The commands (`cli`) call the same rooms themselves, since
+they show progress on the way. Heavy libraries load when a verb is called.
 """
 
 from __future__ import annotations
@@ -198,8 +199,8 @@ def train_odometry(
         folder,
         find_weights(start),
         tuple(data),
-        False,
-        [pictures] if isinstance(pictures, str) else list(pictures),
+        progress=False,
+        pictures=[pictures] if isinstance(pictures, str) else list(pictures),
     )
     publish(folder)
     return Trained(folder / "weights.safetensors", metrics)

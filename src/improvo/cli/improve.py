@@ -145,7 +145,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     from improvo.depth.compile import compile_depth
     from improvo.improvement.improve import improve
-    from improvo.improvement.progress import ImprovementProgress, gain_words
+    from improvo.improvement.progress import ImprovementProgress
+    from improvo.improvement.validation import gain_words
     from improvo.odometry.compile import compile_odometry
 
     compile_odometry(notice)
@@ -162,16 +163,15 @@ def run(arguments: argparse.Namespace) -> int:
         ImprovementProgress(say, shown=not output.as_json()),
         after=arguments.after,
     )
-    kept = result.candidates[result.best].name
+    kept, judge = result.candidates[result.best].name, settings.validation.matches
     figures({"weights": str(result.weights), "best": result.best, "kept": kept}, "")
     if result.best:
-        gain = gain_words(result.validations[result.best], result.validations[0], settings.validation)
-        say(f"kept: {kept}; {gain}")
+        say(f"kept: {kept}; {gain_words(result.validations[result.best], result.validations[0], judge)}")
     else:
         say("no round was better than the start; its weights are kept")
     if result.control:
-        gain = gain_words(result.control[1], result.validations[0], settings.validation)
-        say(f"{result.control[0].name}, by homographies alone: {gain}")
+        control, validation = result.control
+        say(f"{control.name}, by homographies alone: {gain_words(validation, result.validations[0], judge)}")
     say(f"weights in {result.weights}")
     say(f"report in {arguments.output / 'report.html'}")
     next_step(f"`improvo run SEQUENCE --frontend {typed(result.weights)} -o out` uses them")

@@ -68,6 +68,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     _make_streams_usable()
     # Descriptors are matched in small products of matrices: threads of OpenBLAS make that slower.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Threads of torch that wait for each other give the processor back: beside other programs a step of training takes
+    # a third of the processor's time, and the results are the same.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("MPLCONFIGDIR", str(cache_folder() / "matplotlib"))  # made by matplotlib, if it is used
     warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)  # of a name in a title
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # warns where it cannot make that, and works

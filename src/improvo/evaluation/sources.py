@@ -109,22 +109,15 @@ class LoadedFrontend:
             MissingExtraError, ConfigError, InputError: the frontend cannot be loaded.
         """
         loaded = _load(self.name, self.max_keypoints, self.options)
-        return best(features_of(loaded, frame), self.max_keypoints)
+        return features_of(loaded, frame).best(self.max_keypoints)
 
     def of_image(self, image: UInt8) -> Features:
         """As `features`, of an image (H, W) that is no part of a sequence."""
-        return best(_load(self.name, self.max_keypoints, self.options)(image), self.max_keypoints)
+        return _load(self.name, self.max_keypoints, self.options)(image).best(self.max_keypoints)
 
     def check(self) -> None:
         """Load the frontend now, so that a wrong name fails before any work."""
         _load(self.name, self.max_keypoints, self.options)
-
-
-def best(features: Features, count: int) -> Features:
-    """The `count` features of the highest score, best first."""
-    import numpy as np
-
-    return features.take(np.argsort(-features.scores, kind="stable")[:count])
 
 
 @lru_cache(maxsize=8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,8 @@ from improvo.frontend.masking import features_of
 from improvo.sequences import Sequence
 from improvo.tracking.matching import distance_threshold, match_units, unit_descriptors
 from improvo.types import Features, Float32, Int64
+
+_FRAME = re.compile(r"\d{6,}\.png")  # a picture of a frame, as it is named here
 
 
 @dataclass(frozen=True)
@@ -47,10 +50,12 @@ def matched_frames(
         sequence: frames that cannot be read are left out.
         frontend: gives the features.
         settings: which pairs.
-        images: a folder for the frames as delivered, in colour where there is any; None writes none.
+        images: a folder for the frames as delivered, in colour where there is any; None writes none. Frames of an
+            earlier export that this one does not have leave it in the end, since hloc takes all that are there.
         advance: is called after every frame.
     """
     kept: dict[int, tuple[str, Float32]] = {}
+    names: set[str] = set()
     for number, frame in enumerate(sequence):
         name = f"{frame.source_index:06d}.png"
         features = features_of(frontend, frame)
@@ -68,5 +73,9 @@ def matched_frames(
             del kept[past]
         if images is not None:
             write_picture(images / name, sequence.colour(sequence.row(frame)))
+            names.add(name)
         yield MatchedFrame(number, name, features, unit, tuple(matches))
         advance()
+    for path in images.glob("*.png") if images is not None else ():
+        if path.name not in names and _FRAME.fullmatch(path.name):
+            path.unlink()

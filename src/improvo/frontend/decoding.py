@@ -5,15 +5,24 @@ Conventions: the centre of the top-left pixel is (0, 0), and the cell (i, j) is 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from improvo.frontend.architecture import CELL
 from improvo.frontend.masking import unmasked
-from improvo.frontend.runtime import NetworkMaps
 from improvo.frontend.settings import NetworkSettings
 from improvo.types import Features, Float32, Int64, Mask
+
+
+class NetworkMaps(NamedTuple):
+    """The network's output for a batch; the arrays may be overwritten by the next call of the runtime."""
+
+    heat: Float32  # (B, H, W) keypoint probability of every pixel: softmax over a cell, dustbin dropped
+    descriptors: Float32  # (B, Hc, Wc, D) one per cell, not normalised
+    stability_logits: Float32 | None  # (B, Hc, Wc, 2), the second is "stable"; None without a stability head
 
 
 def decode(

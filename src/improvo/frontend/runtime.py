@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from improvo.errors import ConfigError, MissingExtraError, installed
 from improvo.frontend.channel_pruning import without_dead_channels
+from improvo.frontend.decoding import NetworkMaps
 from improvo.frontend.settings import NetworkOptions, NetworkSettings
 from improvo.frontend.weights import Weights
 from improvo.jobs.workers import thread_limit
 from improvo.types import Float32
-
-
-class NetworkMaps(NamedTuple):
-    """The network's output for a batch; the arrays may be overwritten by the next call of the runtime."""
-
-    heat: Float32  # (B, H, W) keypoint probability of every pixel: softmax over a cell, dustbin dropped
-    descriptors: Float32  # (B, Hc, Wc, D) one per cell, not normalised
-    stability_logits: Float32 | None  # (B, Hc, Wc, 2), the second is "stable"; None without a stability head
 
 
 class Runtime(Protocol):

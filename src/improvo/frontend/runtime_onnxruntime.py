@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from improvo.errors import imported
+from improvo.frontend.decoding import NetworkMaps
 from improvo.frontend.onnx_graph import NetworkNodes, OnnxGraph, add_heat_map
-from improvo.frontend.runtime import NetworkMaps
 from improvo.frontend.weights import Weights
 from improvo.types import Float32
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from improvo.frontend.architecture import CELL, POOL_AFTER
+from improvo.frontend.decoding import NetworkMaps
 from improvo.frontend.int8 import (
     ACTIVATION_MAX,
     IMAGE_COPIES,
@@ -20,7 +21,6 @@ from improvo.frontend.int8 import (
 from improvo.frontend.openvino_library import CORE, plain_letters
 from improvo.frontend.openvino_library import openvino as ov
 from improvo.frontend.openvino_library import opset13 as ops
-from improvo.frontend.runtime import NetworkMaps
 from improvo.frontend.weights import Weights
 from improvo.types import Float32
 

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 import numpy as np
 
 from improvo.errors import ConfigError, MissingExtraError
-from improvo.frontend.runtime import NetworkMaps
+from improvo.frontend.decoding import NetworkMaps
 from improvo.frontend.weights import Weights
 from improvo.types import Float32
 

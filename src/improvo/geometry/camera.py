@@ -17,7 +17,11 @@ DISTORTION_MODELS = {"brown": (0, 4, 5, 8), "fisheye": (4,), "fov": (1,)}
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics in pixels; the centre of the top-left pixel is (0, 0)."""
+    """Intrinsics in pixels; the centre of the top-left pixel is (0, 0).
+
+    Raises:
+        InputError: numbers that are not finite or positive, an unknown distortion model, or wrong coefficients.
+    """
 
     width: int
     height: int

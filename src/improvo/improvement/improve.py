@@ -17,6 +17,7 @@ from improvo.errors import ConfigError
 from improvo.files import make_output_folder
 from improvo.folder_lock import locked
 from improvo.frontend.weights import load_weights, save_weights
+from improvo.improvement.decision import rule, why_not_better
 from improvo.improvement.earlier import earlier_runs
 from improvo.improvement.estimate import refuse_full_disk
 from improvo.improvement.folder import COMMAND, Candidate, ImproveFolder
@@ -28,7 +29,7 @@ from improvo.improvement.report import write_report
 from improvo.improvement.rounds import Rounds
 from improvo.improvement.settings import ImproveSettings
 from improvo.improvement.split import Split
-from improvo.improvement.validation import Validation, is_better, rule, summary
+from improvo.improvement.validation import Validation, summary
 from improvo.sequences.given_files import with_absolute_files
 from improvo.terminal import counted
 
@@ -121,12 +122,12 @@ def improve(
                 loop.train(candidate, number, teacher, split.training, teaching)
             validation = loop.validate(candidate, split.held_back, judging)
             best, start_values = result.validations[result.best], result.validations[0]
-            better = is_better(validation, best, start_values, settings.validation)
-            progress.validated(candidate, validation, start_values, settings.validation, better)
+            faults = why_not_better(validation, best, start_values, settings.validation)
+            progress.validated(candidate, validation, start_values, settings.validation, faults)
             result = replace(
                 result,
-                best=number if better else result.best,
-                kept=(*result.kept, number) if better else result.kept,
+                best=result.best if faults else number,
+                kept=result.kept if faults else (*result.kept, number),
                 candidates=(*result.candidates, candidate),
                 validations=(*result.validations, validation),
             )

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from improvo.improvement.folder import Candidate
 from improvo.improvement.settings import ValidationSettings
 from improvo.improvement.split import Split
-from improvo.improvement.validation import Validation, found, gain, loose
+from improvo.improvement.validation import Validation, gain, gain_words, loose
 from improvo.labeling.store import DONE, SequenceRecord
 from improvo.terminal import counted, progress
 
@@ -68,7 +68,7 @@ class ImprovementProgress:
         validation: Validation,
         start: Validation,
         settings: ValidationSettings,
-        better: bool | None = None,
+        faults: str | None = None,
     ) -> None:
         """A summary of one candidate.
 
@@ -77,7 +77,7 @@ class ImprovementProgress:
             validation: what was measured of it.
             start: what was measured of the frontend at the start.
             settings: of the validation.
-            better: whether it is better than the best one before it; None for the start and the control.
+            faults: why it is not better than the best one before it; empty where it is, None for start and control.
         """
         name = loose(settings.matches)
         shares = " / ".join(f"{validation.mean(name, level):.3f}" for level in validation.levels)
@@ -86,15 +86,11 @@ class ImprovementProgress:
             f"{candidate.name}: {shares} of its matches are right within {settings.matches.right_px[1]:g} px at {gaps}"
         )
         if validation is not start:
-            text += f"; all gaps against the start: {gain_words(validation, start, settings)}"
+            text += f"; all gaps against the start: {gain_words(validation, start, settings.matches)}"
             for one in validation.earlier:
                 text += f"; {one}, share: {gain(validation, start, name, settings.matches, earlier=one).words}"
         text += f"; {validation.tracked} of {validation.frames} frames tracked in "
         text += counted(validation.segments, "segment")
-        self.line(text if better is None else f"{text}; {'better, kept' if better else 'not better, not kept'}")
-
-
-def gain_words(validation: Validation, start: Validation, settings: ValidationSettings) -> str:
-    """What right matches gained over the start in number and share, all gaps together."""
-    number, share = (gain(validation, start, name(settings.matches), settings.matches) for name in (found, loose))
-    return f"right matches {number.cell}, their share {share.cell} (95 % intervals)"
+        if faults is not None:
+            text += f"; not better ({faults}), not kept" if faults else "; better, kept"
+        self.line(text)

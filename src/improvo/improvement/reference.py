@@ -185,8 +185,8 @@ def refuse_without_depth(parts: list[ReferencePart], what: str, mend: str) -> No
     if not any(DepthReader(part.depth_file).frames for part in parts):
         names = ", ".join(part.name for part in parts) or "no recording"
         raise InputError(
-            f"{what} ({names}): no frame has depth, because the camera moved too little or shows too little "
-            f"texture; {mend}"
+            f"{what} ({names}): no frame has depth, because the camera moved too little or turned more than it moved, "
+            f"because its path is not known well enough, or for want of texture; {mend}"
         )
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from improvo.errors import InputError
 from improvo.files import write_png
 from improvo.frontend.weights import load_weights
+from improvo.improvement.decision import rule, why_not_better
 from improvo.improvement.folder import Candidate
-from improvo.improvement.progress import gain_words
 from improvo.improvement.settings import ImproveSettings, ValidationSettings
 from improvo.improvement.split import Part, Split
-from improvo.improvement.validation import Validation, found, gain, loose, rule, strict
+from improvo.improvement.validation import Validation, found, gain, gain_words, loose, strict
 from improvo.labeling.store import DONE, read_records
 from improvo.report.improvement_page import Measure, Round, write_improvement_page
 from improvo.sequences import open_sequence
@@ -22,6 +22,7 @@ from improvo.training.metrics import METRICS, read_metrics
 _LOSSES = ("loss", "detector", "descriptor", "stability")
 _PANEL = 400  # pixels, width of each of the three panels of matches
 _SINGLE = 800
+_FEW_PAIRS = 20  # of a gap
 
 
 def write_report(
@@ -158,7 +159,11 @@ def _round(
 def _gains(judged: Sequence[tuple[Candidate, Validation]], settings: ValidationSettings) -> list[list[str]]:
     """Header, then for each frontend after the first its gain in right matches over the first, with intervals."""
     (_, start), *others = judged
-    rows = [["right matches", "all gaps", *(start.gap_words(level) for level in start.levels)]]
+    pairs = [start.pairs(level) for level in start.levels]
+    rows = [
+        ["right matches", "all gaps", *(start.gap_words(level) for level in start.levels)],
+        ["pairs of frames", str(sum(pairs)), *map(str, pairs)],
+    ]
     for candidate, validation in others:
         narrow, wide = settings.matches.right_px
         names = {
@@ -180,17 +185,24 @@ def _verdict(
     control: tuple[Candidate, Validation] | None,
 ) -> str:
     start, how = validations[0], settings.validation
-    words = rule(how)
+    lines = []
     if best:
-        words += f" Kept: {candidates[best].name}; against the start: "
-        words += f"{gain_words(validations[best], start, how)}."
+        gained = gain_words(validations[best], start, how.matches)
+        lines.append(f"Kept: {candidates[best].name}; against the start: {gained}.")
     elif len(candidates) > 1:
-        words += " No round was better than the start: the weights kept are those at the start, unchanged."
-        words += f" {candidates[-1].name}: {gain_words(validations[-1], start, how)}."
+        lines.append("No round was better than the start: the weights kept are those at the start, unchanged.")
+    before = start
+    for candidate, validation in zip(candidates[1:], validations[1:], strict=True):
+        faults = why_not_better(validation, before, start, how)
+        if faults:
+            gained = gain_words(validation, start, how.matches)
+            lines.append(f"{candidate.name.capitalize()} is not kept: {faults}. Against the start: {gained}.")
+        before = before if faults else validation
     if control:
-        words += " The control, trained for as many rounds and steps on the same frames by homographies alone: "
-        words += f"{gain_words(control[1], start, how)}."
-    return words
+        gained = gain_words(control[1], start, how.matches)
+        words = "The control, trained for as many rounds and steps on the same frames by homographies alone"
+        lines.append(f"{words}: {gained}.")
+    return "\n".join([*lines, rule(how, bool(start.earlier))])
 
 
 def _notes(
@@ -204,6 +216,13 @@ def _notes(
             f"What is held back is too short for {wanted} gaps: judged by pairs {gaps} apart. Short gaps are easy; "
             "judge by longer recordings before you believe a small gain."
         )
+    for level in start.levels:
+        if start.pairs(level) < _FEW_PAIRS:
+            notes.append(
+                f"Only {start.pairs(level)} pairs of frames held back are {start.gap_words(level)} apart, and all look "
+                "at much the same: believe little of what is said of them. Hold back more, with --evaluate or "
+                "--set split.share=0.33 in another folder."
+            )
     notes += [f"Left out: {reason}" for reason in split.unusable]
     for candidate, validation in zip(candidates, validations, strict=True):
         notes += [f"{candidate.name}, no labels of {failure}" for failure in validation.failures]

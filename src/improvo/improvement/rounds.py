@@ -128,9 +128,10 @@ class Rounds:
             with self._progress.bar(f"depth of the reference, {kind}", "frame") as tick:
                 self._crew.results(do_depth_job, jobs, tick)
             found.append(parts)
-        mend = "record with a moving camera, or hold back other recordings with --evaluate"
+        mend = "record with a camera that moves sideways, or hold back other recordings with --evaluate"
         refuse_without_depth(found[0], "the training part", mend)
-        refuse_without_depth(found[1], "what is held back", mend)
+        more = ", or more of this one with --set split.share=0.33 and another -o" if len(paths) == 1 else ""
+        refuse_without_depth(found[1], "what is held back", mend + more)
         return found[0], found[1]
 
     def label(self, teacher: Candidate, part: Part) -> list[SequenceRecord]:

@@ -1,4 +1,4 @@
-"""What is known of a frontend on what was held back, and which of two is better."""
+"""What is known of a frontend on what was held back, and what it adds to another one."""
 
 from __future__ import annotations
 
@@ -77,6 +77,10 @@ class Validation:
         """Mean of a value over the pairs of a gap, or of all gaps with the same weight."""
         chosen = [scores for scores in self.own if level in (None, scores.level)]
         return float(np.mean([np.mean(scores.values[name]) for scores in chosen]))
+
+    def pairs(self, level: int) -> int:
+        """How many pairs of frames there are of a gap."""
+        return sum(len(scores.pairs) for scores in self.own if scores.level == level)
 
     def gap_words(self, level: int) -> str:
         """The gap in frames and seconds, for a person; the range of it over the recordings."""
@@ -168,47 +172,10 @@ def gain(
     return Gain(compared["first"], compared["second"], *compared["interval"])
 
 
-def rule(settings: ValidationSettings) -> str:
-    """The decision rule, in a sentence."""
-    return (
-        f"A frontend is better than the one at the start if, on the frames held back, more of its matches are right "
-        f"within {settings.matches.right_px[1]:g} pixels, or a larger share of them is, by more than chance (95 % "
-        f"interval, all gaps together), and if neither is less by more than chance; better than the best one before it "
-        f"if number and share together are larger and neither is less by more than chance; and if the odometry is not "
-        f"worse with it: it loses no more than {100 * settings.frames_lost:g} % of the frames that it tracked with the "
-        f"other, and breaks no more often. In no recording of an earlier run may the share be less by more than chance."
-    )
-
-
-def is_better(candidate: Validation, best: Validation, start: Validation, settings: ValidationSettings) -> bool:
-    """Whether a frontend is better than the best one before it; `rule` says it in words.
-
-    That it is better than the start must be more than chance. Between two that are, the one with the larger sum of
-    what number and share gained is the better guess, although the difference may be chance.
-
-    Args:
-        candidate: what was measured of it.
-        best: what was measured of the best one, on the same frames and pairs.
-        start: what was measured at the start, likewise; the same as `best` for a first round.
-        settings: what its odometry may lose.
-    """
-    judge = settings.matches
-    over_best, over_start = (
-        [gain(candidate, before, name(judge), judge) for name in (loose, found)] for before in (best, start)
-    )
-    larger = sum(one.relative for one in over_best) > 0
-    gained = any(one.low > 0 for one in over_start)
-    no_less = all(one.high >= 0 for one in (*over_best, *over_start))
-    return larger and gained and no_less and all(_no_worse(candidate, before, settings) for before in (best, start))
-
-
-def _no_worse(candidate: Validation, before: Validation, settings: ValidationSettings) -> bool:
-    """Whether nothing else is lost: no frames of the odometry, no recording of an earlier run."""
-    judge = settings.matches
-    kept = candidate.tracked >= (1 - settings.frames_lost) * before.tracked
-    whole = candidate.segments <= max(before.segments, 1) + settings.segments_more  # none where nothing was tracked
-    remembered = all(gain(candidate, before, loose(judge), judge, None, one).high >= 0 for one in before.earlier)
-    return kept and whole and remembered
+def gain_words(validation: Validation, start: Validation, settings: SelfTruthSettings) -> str:
+    """What right matches gained over the start in number and share, all gaps together."""
+    number, share = (gain(validation, start, name(settings), settings) for name in (found, loose))
+    return f"right matches {number.cell}, their share {share.cell} (95 % intervals)"
 
 
 def summary(validation: Validation, start: Validation, settings: ValidationSettings) -> dict[str, Any]:

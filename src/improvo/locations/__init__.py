@@ -28,12 +28,6 @@ _FILES = "files"  # in a folder for each location
 _places: dict[Path, Place] = {}
 
 
-def is_remote(text: str) -> bool:
-    """Whether this names a location, and not a file or folder of this machine."""
-    match = _SCHEME.fullmatch(text)
-    return match is not None and match.group(1) != "file"
-
-
 def local_folder(text: str | Path, writing: bool = True) -> Path:
     """The folder to work in: the path itself, or one that stands for a location.
 

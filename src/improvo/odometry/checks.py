@@ -28,7 +28,7 @@ def check_parts(frontend: object, camera: object) -> None:
     if not isinstance(camera, Camera):
         raise TypeError(f"camera: is a {type(camera).__name__}, give an `improvo.Camera`, or that of a sequence")
     if not camera.is_pinhole:
-        mend = "undistort the pictures and give the camera that they have then, as `improvo.open_sequence` does"
+        mend = "undistort the pictures, by `improvo.sequences.rectification.Rectifier`, and give the camera of those"
         raise InputError(f"camera: has distortion, and the odometry reads undistorted pictures; {mend}")
 
 

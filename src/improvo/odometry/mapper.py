@@ -10,7 +10,8 @@ from improvo.odometry.mapping.local_map import LocalMap
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import TrackingState
-from improvo.odometry.view import Mask, View
+from improvo.odometry.view import View
+from improvo.types import Mask
 
 
 class Mapper(ABC):

@@ -12,7 +12,7 @@ import numpy as np
 from improvo.backend.settings import SolverSettings
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.odometry.alarms.health import HealthCheck
+from improvo.odometry.alarms.two_view_check import TwoViewCheck
 from improvo.odometry.events import EventLog
 from improvo.odometry.gates import FEWEST
 from improvo.odometry.mapper import Mapper
@@ -67,7 +67,7 @@ class PaperMapper(Mapper):
             max_error=None,
         )
         self._result.add_window(report)
-        if self._health.contradicts(view, {earlier.frame_index: earlier for earlier in self._window}):
+        if self._two_view_check.contradicts(view, {earlier.frame_index: earlier for earlier in self._window}):
             self._events.contradicted(view.frame_index, "the mode `paper` goes on all the same")
         if len(self._window) > self._settings.window.paper_poses:
             self._finalise(self._window.pop(0), self._map)
@@ -85,7 +85,7 @@ class PaperMapper(Mapper):
 
     def _begin_segment(self, view: View) -> LocalMap:
         """A world of its own, with nothing known of the one before."""
-        self._health = HealthCheck(self._camera, self._settings, self._descriptor_distance)
+        self._two_view_check = TwoViewCheck(self._camera, self._settings, self._descriptor_distance)
         self._events.segment_started(view.frame_index, self._result.running_segment)
         self._result.begin_segment()
         view.cam_from_world = np.eye(4)

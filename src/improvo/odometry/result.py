@@ -13,9 +13,9 @@ from improvo.geometry.camera import Camera
 from improvo.odometry.map_builder import MapBuilder
 from improvo.odometry.mapping.window import WindowReport
 from improvo.odometry.segments import Segment, SegmentPlacement, extended
-from improvo.odometry.trajectory_builder import FinalView, TrajectoryBuilder
+from improvo.odometry.trajectory_builder import TrajectoryBuilder
 from improvo.odometry.verdict.verdict import NOT_JUDGED, Verdict
-from improvo.odometry.view import NO_POINT, View
+from improvo.odometry.view import NO_POINT, FinalView, View
 from improvo.types import Float64, SparseMap, Trajectory
 
 _NO_POSE = np.full((4, 4), np.nan)

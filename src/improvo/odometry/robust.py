@@ -5,8 +5,8 @@ from __future__ import annotations
 from improvo.geometry.camera import Camera
 from improvo.odometry.alarms.attached import AttachedDetector
 from improvo.odometry.alarms.focal_change import LensWatch
-from improvo.odometry.alarms.health import HealthCheck
-from improvo.odometry.alarms.second_map import SecondOpinion
+from improvo.odometry.alarms.second_opinion import SecondOpinion
+from improvo.odometry.alarms.two_view_check import TwoViewCheck
 from improvo.odometry.events import EventLog
 from improvo.odometry.gates import MEMORY_FRAMES, gate
 from improvo.odometry.mapper import Mapper
@@ -21,10 +21,10 @@ from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import StateMachine, TrackingState
 from improvo.odometry.verdict.judging import SegmentJudge
-from improvo.odometry.view import Mask, View
-from improvo.types import Float64
+from improvo.odometry.view import View
+from improvo.types import Float64, Mask
 
-_CARRIED = 0.2  # share of the observations that turned out to move with the camera; with more the map is wrong
+_MOST_ATTACHED = 0.2  # share of a map's observations that turn out to move with the camera; with more it is wrong
 _MAX_BUFFERED = 300  # frames in the initialisation buffer; the oldest leaves it without a pose
 _LOST = "lost"  # why a segment ended
 _TWO_VIEWS, _ATTACHED = "two-view geometry", "what moves with the camera"  # what contradicted it
@@ -52,10 +52,10 @@ class RobustMapper(Mapper):
         self._worlds = 0  # maps started
         self._lens = LensWatch(camera, settings.tolerance, settings.seed)
         self._contradicted = 0  # maps in a row by two-view geometry, each over frames of the one before
-        self._carried = False  # a large part of the map has turned out to move with the camera
+        self._map_is_attached = False  # a large part of it has turned out to move with the camera
         self._second_opinion = SecondOpinion(camera, settings, descriptor_distance, events)
         self._window = SlidingWindow(settings.window, camera.width)
-        self._health = HealthCheck(camera, settings, descriptor_distance)
+        self._two_view_check = TwoViewCheck(camera, settings, descriptor_distance)
         self._judge = SegmentJudge(camera, settings, camera_is_guess)
         self._bridging = Bridging(settings)
         self._provisional: list[View] = []  # all views of a provisional map with a pose, in order; none is final
@@ -78,8 +78,8 @@ class RobustMapper(Mapper):
                 self._leave_out_attached(view, self._buffer)
             self._initialise(view)
             return
-        if newly_attached and self._leave_out_attached(view, [*self._map.history, *self._buffer]) > _CARRIED:
-            self._carried = True
+        if newly_attached and self._leave_out_attached(view, [*self._map.history, *self._buffer]) > _MOST_ATTACHED:
+            self._map_is_attached = True
         if self._lens.changed(self._window.newest, view, self._map.store.xyz):
             self._events.focal_length(view.frame_index, self._lens.factor, "the segment ends")
             self._end_segment("the focal length changed")
@@ -95,14 +95,14 @@ class RobustMapper(Mapper):
         report = self._adjust_window(self._map)
         self._map.remember(view)
         self._result.add_window(report)
-        if self._carried:
+        if self._map_is_attached:
             self._start_anew(view, _ATTACHED)
             return
         history = {earlier.frame_index: earlier for earlier in self._map.history}
-        if self._health.contradicts(view, history) and not self._stands(list(history.values())):
+        if self._two_view_check.contradicts(view, history) and not self._stands(list(history.values())):
             self._start_anew(view, _TWO_VIEWS)
             return
-        if self._health.ambiguous:
+        if self._two_view_check.ambiguous:
             self._events.two_motions(view.frame_index)
             self._judge.suspicion(_ANOTHER_MOTION)
         self._bridge(self._map, [view])
@@ -158,7 +158,7 @@ class RobustMapper(Mapper):
             self._judge.suspicion(words, self._contradicted if self._contradicted > 1 else 0)
         self._result.begin_segment()
         self._result.give_up(each for each in self._buffer if each.cam_from_world is None)
-        self._health = HealthCheck(self._camera, self._settings, self._descriptor_distance)
+        self._two_view_check = TwoViewCheck(self._camera, self._settings, self._descriptor_distance)
         self._bridging.new_map()
         for each in self._buffer:
             if each.cam_from_world is not None:
@@ -186,7 +186,7 @@ class RobustMapper(Mapper):
 
     def _confirm(self) -> None:
         """A map that was checked and not contradicted for long enough is trusted, and its old frames become final."""
-        if self._states.is_provisional and self._health.has_judged and len(self._provisional) > MEMORY_FRAMES:
+        if self._states.is_provisional and self._two_view_check.has_judged and len(self._provisional) > MEMORY_FRAMES:
             self._states.map_confirmed()
             self._provisional = []
 
@@ -226,7 +226,7 @@ class RobustMapper(Mapper):
             self._judge.suspicion(
                 f"{_TWO_VIEWS} spoke against the map, and a second map did not", 0
             )  # which settles it
-        self._health.start_over()
+        self._two_view_check.start_over()
         return True
 
     def _start_anew(self, view: View, by: str) -> None:
@@ -318,4 +318,4 @@ class RobustMapper(Mapper):
         self._window = SlidingWindow(self._settings.window, self._camera.width)
         self._provisional = []
         self._cooldown, self._costly_failures = 0, 0
-        self._carried = False
+        self._map_is_attached = False

@@ -30,7 +30,7 @@ from improvo.odometry.map_file import write_map
 from improvo.odometry.point_colours import PointColours
 from improvo.odometry.recorder import TrackRecorder
 from improvo.odometry.run_settings import RunSettings
-from improvo.odometry.trajectory_builder import FinalView
+from improvo.odometry.view import FinalView
 from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
 from improvo.odometry.visualizer import NullVisualizer, Visualizer
 from improvo.sequences import Sequence

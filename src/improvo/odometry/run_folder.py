@@ -20,11 +20,10 @@ from improvo.geometry.trajectory_files import read_trajectory
 from improvo.odometry.map_file import read_map
 from improvo.odometry.run import unit_of
 from improvo.odometry.verdict.told_verdicts import doubtful_frames, uncertain_frames
-from improvo.odometry.view import Mask
 from improvo.sequences import Sequence, SequenceSettings, open_sequence
 from improvo.stability.rule import IGNORE
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
-from improvo.types import Float64, Int64, SparseMap, Trajectory, UInt8
+from improvo.types import Float64, Int64, Mask, SparseMap, Trajectory, UInt8
 from improvo.untrusted.paths import as_text, check_path
 from improvo.untrusted.text import read_json_file, reason
 

@@ -1,18 +1,16 @@
-"""A frame as the odometry holds it, and the store of the points that it observes."""
+"""A frame as the odometry holds it, and as it leaves it; and the store of the points that it observes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from improvo.odometry.settings import OdometrySettings
-from improvo.types import Float32, Float64, Int64, UInt8
+from improvo.types import Float32, Float64, Int64, Mask, UInt8
 
 NO_POINT = -1
 _ENOUGH = 50  # keypoints for a RANSAC; with fewer stable ones all are used, since a doubtful pose is better than none
-Mask = NDArray[np.bool_]
 
 
 @dataclass(eq=False)
@@ -71,6 +69,20 @@ class View:
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+
+@dataclass(frozen=True)
+class FinalView:
+    """A frame that nothing can change any more."""
+
+    frame_index: int
+    time: float  # seconds
+    segment: int  # -1 without a pose
+    world_from_cam: Float64  # (4, 4), NaN without a pose
+    keypoints: Float64  # (N, 2) pixels
+    tracks: Int64  # (N,) connect-the-dots track
+    points: Int64  # (N,) id of the map point, -1 for none
+    weights: Float64  # (N,) w_ij
 
 
 class PointStore:

@@ -22,8 +22,7 @@ from improvo.odometry.robust import RobustMapper
 from improvo.odometry.segments import Segment
 from improvo.odometry.settings import OdometrySettings, RefinementSettings
 from improvo.odometry.states import TrackingState
-from improvo.odometry.trajectory_builder import FinalView
-from improvo.odometry.view import View
+from improvo.odometry.view import FinalView, View
 from improvo.tracking.connect import TrackChain
 from improvo.tracking.matching import distance_threshold, match_units, unit_descriptors, without_flow_outliers
 from improvo.types import Features, Float32, Float64, Frame, Int64, SparseMap, Trajectory, UInt8

@@ -58,7 +58,7 @@ def write_improvement_page(
         rounds: at least one; the first is the frontend before.
         notes: what the reader should know, in plain words.
         best: the round that is held against the first.
-        verdict: which round is kept, and why.
+        verdict: which round is kept, and why; each line is a paragraph.
         gains: a header and a row for each round after the first, gains over the first with their intervals.
     """
     first, last = rounds[0], rounds[best]
@@ -70,8 +70,8 @@ def write_improvement_page(
             if measure.name in first.values and measure.name in last.values
         ]
     )
-    if verdict:
-        page.paragraph(verdict)
+    for paragraph in verdict.splitlines():
+        page.paragraph(paragraph)
     page.heading("What to look out for")
     nothing = "every measure is at least as good as before" if best else "the weights are those at the start"
     page.warnings([*notes, *_setbacks(measures, first, last)], f"Nothing: {nothing}.")

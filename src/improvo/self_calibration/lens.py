@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from improvo.errors import InputError
 from improvo.geometry.camera import MIN_DEPTH, Camera
 from improvo.types import Float64
 
@@ -114,19 +113,6 @@ class Lens:
         growth = (1.0 + a2 * (3.0 * k1 + 5.0 * a2 * k2)) / (1.0 + r2)
         slope = (growth * r - distorted) / (2.0 * r * np.maximum(r2, 1e-16))
         return distorted / r, slope, angle * a2 / r, angle * a2 * a2 / r
-
-
-def lens_of(camera: Camera) -> Lens:
-    """The lens of a camera with at most two radial coefficients.
-
-    Raises:
-        InputError: a camera with other distortion.
-    """
-    k = (*camera.distortion, 0.0, 0.0)
-    if camera.distortion_model not in MODELS or any(k[2:]):
-        raise InputError(f"a {camera.distortion_model} camera with {len(camera.distortion)} coefficients is no start")
-    values = np.array([camera.fx, camera.fy, camera.cx, camera.cy, k[0], k[1]])
-    return Lens(values, camera.distortion_model, camera.width, camera.height)
 
 
 def lens_with_fov(degrees: float, width: int, height: int, model: str = "brown", k1: float = 0.0) -> Lens:

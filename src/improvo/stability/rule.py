@@ -83,9 +83,14 @@ def label_stability(
 
     Returns:
         Labels. A point behind one of the cameras that saw it is never called stable.
+
+    Raises:
+        ValueError: rows that are not sorted, arrays of shapes that do not fit each other, or frames without a row of
+            poses.
     """
     from improvo.geometry.triangulation import triangulate_tracks
 
+    _check(tracks, cam_from_world, segment, K)
     settings = settings or LabelSettings()
     first = np.flatnonzero(np.diff(tracks.track, prepend=np.iinfo(np.int64).min)) if len(tracks) else np.zeros(0, int)
     row_track = np.repeat(np.arange(len(first)), np.diff(first, append=len(tracks)))
@@ -124,6 +129,27 @@ def label_stability(
         withheld=np.zeros(count, np.bool_),
         errors=errors,
     )
+
+
+def _check(tracks: Tracks, cam_from_world: Float64, segment: Int64, K: Float64) -> None:
+    """Refuse arrays that would give labels, and wrong ones."""
+    rows, frames = len(tracks), len(cam_from_world)
+    shapes = {
+        "tracks.track": (np.shape(tracks.track), (rows,)),
+        "tracks.keypoints": (np.shape(tracks.keypoints), (rows, 2)),
+        "tracks.weight": (np.shape(tracks.weight), (rows,)),
+        "cam_from_world": (np.shape(cam_from_world), (frames, 4, 4)),
+        "segment": (np.shape(segment), (frames,)),
+        "K": (np.shape(K), (3, 3)),
+    }
+    for name, (shape, wanted) in shapes.items():
+        if shape != wanted:
+            raise ValueError(f"{name}: shape {shape}, expected {wanted}")
+    if rows and not 0 <= tracks.frame.min() <= tracks.frame.max() < frames:
+        raise ValueError(f"tracks.frame: refers to rows outside 0..{frames - 1} of cam_from_world")
+    step = np.diff(tracks.track)
+    if (step < 0).any() or (np.diff(tracks.frame)[step == 0] <= 0).any():
+        raise ValueError("tracks: rows must be sorted by track, then frame, each frame once; sort them")
 
 
 def _home_segment(row_segment: Int64, row_track: Int64, count: int) -> Int64:

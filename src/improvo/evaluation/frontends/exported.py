@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from improvo.errors import InputError, imported
-from improvo.evaluation.sources import best
 from improvo.frontend.masking import without_masked
 from improvo.sequences import Sequence
 from improvo.types import Features, Frame
@@ -76,7 +75,7 @@ class ExportedFeatures:
         arrays = _read_hdf5(self.path, found) if index.hdf5 else _read_npz(Path(self.path) / found)
         where = f"{self.path}: {found}"
         exported = to_features(arrays, where, (sequence.camera.width, sequence.camera.height))
-        return best(without_masked(exported, frame.mask), self.max_keypoints)
+        return without_masked(exported, frame.mask).best(self.max_keypoints)
 
 
 @dataclass(frozen=True)

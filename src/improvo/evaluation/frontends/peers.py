@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from improvo.errors import MissingExtraError
-from improvo.evaluation.sources import best
 from improvo.frontend import Frontend
 from improvo.frontend.masking import without_masked
 from improvo.types import Features, Mask, UInt8
@@ -49,7 +48,7 @@ class PeerFrontend:
         with torch.inference_mode():
             tensors = extract(torch.from_numpy(np.ascontiguousarray(image))[None, None].float() / 255.0)
         keypoints, descriptors, scores = (np.asarray(tensor, np.float32) for tensor in tensors)
-        return best(without_masked(Features(keypoints, descriptors, scores), mask), self._max_keypoints)
+        return without_masked(Features(keypoints, descriptors, scores), mask).best(self._max_keypoints)
 
 
 def load_peer(name: str, max_keypoints: int) -> Frontend:

@@ -132,7 +132,8 @@ def score_pairs(
     for (a, b), motion in zip(pairs.tolist(), motions, strict=True):
         depth = _depth_map(run, a)
         geometry = PairGeometry(run.camera, motion, depth, None)
-        found = evaluate_pair(geometry, _best(features(a), settings), _best(features(b), settings), protocol)
+        of_a, of_b = (features(frame).best(settings.max_keypoints) for frame in (a, b))
+        found = evaluate_pair(geometry, of_a, of_b, protocol)
         matches.append(int(found["judged"][0]))
         known = depth[np.isfinite(depth)]
         rows.append(_values(found, float(np.median(known)) if len(known) else 0.0, settings))
@@ -204,10 +205,6 @@ def _values(records: Records, median_depth: float, settings: SelfTruthSettings) 
 
 def _mean(success: NDArray[np.bool_]) -> float:
     return float(success.mean())
-
-
-def _best(features: Features, settings: SelfTruthSettings) -> Features:
-    return features.take(np.arange(min(len(features), settings.max_keypoints)))
 
 
 def _depth_map(run: FixedRun, frame: int) -> Float32:

@@ -20,9 +20,9 @@ from improvo.geometry.epipolar import half_line_distances
 from improvo.geometry.ransac import Ransac, relative_pose
 from improvo.odometry.gates import FAR, FEATURES, LARGE_PART, STEP_FRAMES
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.view import NO_POINT, Mask, View, common_tracks
+from improvo.odometry.view import NO_POINT, View, common_tracks
 from improvo.tracking.matching import match_units
-from improvo.types import Float64, Int64
+from improvo.types import Float64, Int64, Mask
 
 _COLUMNS, _ROWS = 16, 12  # cells of the picture
 _MIN_MOVING = 20  # matches that moved; fewer say nothing about the camera

@@ -65,4 +65,4 @@ def _strongest_first(a: Features, b: Features) -> Features:
         np.concatenate([a.scores, b.scores]),
         None if a.stability is None or b.stability is None else np.concatenate([a.stability, b.stability]),
     )
-    return both.take(np.argsort(-both.scores, kind="stable"))
+    return both.best(len(both))

@@ -15,7 +15,7 @@ import numpy as np
 from improvo.geometry import se3
 from improvo.geometry.alignment import Similarity
 from improvo.odometry.gates import SAME_SCALE, SAME_TURN_DEG
-from improvo.odometry.mapping.course import Course
+from improvo.odometry.mapping.camera_path import CameraPath
 from improvo.odometry.mapping.former_map import FormerMap, Sighting
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
@@ -109,16 +109,16 @@ class Bridging:
         return join
 
     def _believed(self, former: FormerMap, a: Sighting, b: Sighting, running: Sequence[View]) -> Join | None:
-        """The join by two sightings; None where they contradict each other or the camera's course."""
+        """The join by two sightings; None where they contradict each other or the camera's path."""
         join = _joined(former, a, b, self._max_error)
         if join is None or join.points < self._min_points:  # a place that looks alike has a few points, too
             return None
         if join.scale_error > self._max_error:
             return None
-        here = Course.of(running).placed(join.shared_from_new)
+        here = CameraPath.of(running).placed(join.shared_from_new)
         # where texture repeats, a place one repetition off looks the same, in every view
         slack = self._max_error * b.depth * former.shared_from_own.scale
-        return None if here.is_leap_from(former.course, slack=slack) else join
+        return None if here.is_leap_from(former.camera_path, slack=slack) else join
 
 
 def _joined(former: FormerMap, a: Sighting, b: Sighting, max_error: float) -> Join | None:

@@ -13,7 +13,7 @@ from improvo.geometry.alignment import Similarity
 from improvo.geometry.camera import Camera
 from improvo.geometry.ransac import Ransac, absolute_pose
 from improvo.odometry.gates import FEWEST
-from improvo.odometry.mapping.course import Course
+from improvo.odometry.mapping.camera_path import CameraPath
 from improvo.odometry.view import View
 from improvo.tracking.matching import match_units
 from improvo.types import Float32, Float64, Int64
@@ -71,7 +71,7 @@ class FormerMap:
     ) -> None:
         self.number, self.shared_from_own = number, shared_from_own
         self.last_frame = max((view.frame_index for view in views), default=-1)
-        self.course = Course.of(views).placed(shared_from_own)  # in the world that all segments are placed in
+        self.camera_path = CameraPath.of(views).placed(shared_from_own)  # in the world that all segments are placed in
         self._camera = camera
         self._descriptor_distance = descriptor_distance
         self._ransac = Ransac(max_error, seed, min_iterations=100, max_iterations=2000)

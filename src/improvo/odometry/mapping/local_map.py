@@ -15,9 +15,9 @@ from improvo.odometry.gates import FEWEST, MEMORY_FRAMES, MIN_PARALLAX_DEG, gate
 from improvo.odometry.mapping.projection_search import match_by_projection
 from improvo.odometry.refinement.keypoint_refinement import KeypointRefiner
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.view import NO_POINT, Mask, PointStore, View, inherit_points, ransac_rows
+from improvo.odometry.view import NO_POINT, PointStore, View, inherit_points, ransac_rows
 from improvo.tracking.matching import match_units
-from improvo.types import Float32, Float64, Int64
+from improvo.types import Float32, Float64, Int64, Mask
 
 _WRONG_SHARE = 0.1  # of wrong matches that agree with a wrong pose, where the scene repeats or is mirrored
 _SEARCH = 8.0 / 640.0  # of the picture's width, between a map point's projection and its keypoint

@@ -10,8 +10,8 @@ import numpy as np
 from improvo.backend.problem import BundleProblem, BundleResult
 from improvo.backend.settings import ObjectiveSettings, SolverSettings
 from improvo.backend.solver import solve
-from improvo.odometry.view import NO_POINT, Mask, PointStore, View
-from improvo.types import Float64, Int64
+from improvo.odometry.view import NO_POINT, PointStore, View
+from improvo.types import Float64, Int64, Mask
 
 OBJECTIVE = ObjectiveSettings(depth_weight=0.0)  # the paper's, without the regulariser, which is wrong outdoors
 SOLVER = SolverSettings(max_iterations=8, relative_decrease=1e-3)  # the next frame's solve goes on from there

@@ -24,8 +24,8 @@ from improvo.odometry.verdict.path_error import error_percent, scale_leverage
 from improvo.odometry.verdict.seen_again import SeenAgain, leaps, looked_again
 from improvo.odometry.verdict.shared_errors import shared_error
 from improvo.odometry.verdict.turning_camera import TurningCamera, turning_camera
-from improvo.odometry.view import Mask, View
-from improvo.types import Float64, Int64
+from improvo.odometry.view import View
+from improvo.types import Float64, Int64, Mask
 
 QUARTERS = ("without the upper left", "without the upper right", "without the lower left", "without the lower right")
 HALVES = ("half of the points", "the other half of the points")

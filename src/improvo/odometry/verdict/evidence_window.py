@@ -9,8 +9,7 @@ import numpy as np
 
 from improvo.backend.problem import BundleProblem
 from improvo.geometry.camera import Camera
-from improvo.odometry.view import Mask
-from improvo.types import Float64, Int64
+from improvo.types import Float64, Int64, Mask
 
 
 @dataclass(frozen=True)

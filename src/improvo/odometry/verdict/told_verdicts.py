@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from improvo.odometry.verdict.verdict import DOUBTFUL, NOT_JUDGED
-from improvo.odometry.view import Mask
-from improvo.types import Int64
+from improvo.types import Int64, Mask
 
 
 def verdict_of(segment: Mapping[str, Any]) -> dict[str, Any]:

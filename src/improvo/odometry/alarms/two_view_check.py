@@ -44,7 +44,7 @@ class Agreement:
     own_tracked: int = 0
 
 
-class HealthCheck:
+class TwoViewCheck:
     """Compares the map with two-view geometry every few frames.
 
     On five real sequences with three frontends a right map keeps at least 90 % of the two views' own inliers over

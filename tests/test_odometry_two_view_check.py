@@ -7,7 +7,7 @@ import pytest
 from simulated_features import CAMERA, hand_motion, observe, room, views_of
 
 from improvo.geometry import se3
-from improvo.odometry.alarms.health import HealthCheck
+from improvo.odometry.alarms.two_view_check import TwoViewCheck
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
 from improvo.tracking.matching import unit_descriptors
@@ -23,7 +23,7 @@ def alarms(estimate: Float64, truth: Float64, tracked: bool = True) -> list[int]
         tracked: whether tracks lead from each view to every other; else no match is a track.
     """
     world = room()
-    check = HealthCheck(CAMERA, OdometrySettings(), descriptor_distance=0.7)
+    check = TwoViewCheck(CAMERA, OdometrySettings(), descriptor_distance=0.7)
     earlier: dict[int, View] = {}
     said = []
     for position, (believed, true) in enumerate(zip(estimate, truth, strict=True)):
@@ -88,7 +88,7 @@ def test_tracks_decide_between_the_map_and_matches_of_repeated_texture(tracked: 
     other[:, 1, 3] += 0.08 * np.arange(40)
     right = views_of([observe(room(0), pose, seed=i, limit=100) for i, pose in enumerate(believed)])
     wrong = views_of([observe(room(1), pose, seed=i, limit=300) for i, pose in enumerate(other)])
-    check = HealthCheck(CAMERA, OdometrySettings(), descriptor_distance=0.7)
+    check = TwoViewCheck(CAMERA, OdometrySettings(), descriptor_distance=0.7)
     earlier: dict[int, View] = {}
     said = []
     for position, (a, b) in enumerate(zip(right, wrong, strict=True)):

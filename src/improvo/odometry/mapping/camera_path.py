@@ -16,7 +16,7 @@ _FASTER = 3.0  # times the fastest motion before and after a gap; a camera is of
 
 
 @dataclass(frozen=True)
-class Course:
+class CameraPath:
     """Where a camera was, and when.
 
     Attributes:
@@ -29,14 +29,14 @@ class Course:
     centers: Float64
 
     @classmethod
-    def of(cls, views: Iterable[View]) -> Course:
+    def of(cls, views: Iterable[View]) -> CameraPath:
         """That of views in temporal order; those without a pose are left out."""
         posed = [(view, view.cam_from_world) for view in views if view.cam_from_world is not None]
         clocks = np.array([[view.frame_index, view.time] for view, _ in posed], np.float64).reshape(-1, 2)
         centers = np.array([se3.inverse(pose)[:3, 3] for _, pose in posed], np.float64).reshape(-1, 3)
         return cls(clocks, centers)
 
-    def placed(self, other_from_own: Similarity) -> Course:
+    def placed(self, other_from_own: Similarity) -> CameraPath:
         """The same in another world."""
         return replace(self, centers=other_from_own.apply(self.centers))
 
@@ -51,8 +51,8 @@ class Course:
         largest: Float64 = speeds.max(axis=0)
         return largest
 
-    def is_leap_from(self, before: Course, slack: float) -> bool:
-        """Whether the camera would have moved much faster from the end of one course to the start of this one.
+    def is_leap_from(self, before: CameraPath, slack: float) -> bool:
+        """Whether the camera would have moved much faster from the end of one path to the start of this one.
 
         Args:
             before: in the same world.

@@ -9,8 +9,8 @@ import pytest
 from simulated_features import CAMERA, hand_motion, observe, room, views_of
 
 from improvo.geometry import se3
-from improvo.odometry.alarms import second_map
-from improvo.odometry.alarms.second_map import SecondOpinion, explained_tracks, same_poses
+from improvo.odometry.alarms import second_opinion
+from improvo.odometry.alarms.second_opinion import SecondOpinion, explained_tracks, same_poses
 from improvo.odometry.events import EventLog
 from improvo.odometry.mapping.initial_pair import TWO_MOTIONS, InitFailure
 from improvo.odometry.settings import OdometrySettings
@@ -40,7 +40,7 @@ def wrong(truth: Float64 = TRUTH) -> Float64:
     return np.stack(poses)
 
 
-def second_opinion() -> tuple[SecondOpinion, EventLog]:
+def opinion_and_log() -> tuple[SecondOpinion, EventLog]:
     log = EventLog()
     return SecondOpinion(CAMERA, OdometrySettings(), 0.7, log), log
 
@@ -50,7 +50,7 @@ def poses_of(world_from_cam: Float64) -> dict[int, Float64]:
 
 
 def test_a_right_map_stays_and_its_views_are_not_touched() -> None:
-    views, (opinion, log) = tracked(TRUTH), second_opinion()
+    views, (opinion, log) = tracked(TRUTH), opinion_and_log()
     assert opinion.stands(views, "a crowd")
     assert [(event.frame_index, event.kind) for event in log.events] == [(FRAMES - 1, "checked again")]
     assert "a crowd" in log.events[0].detail
@@ -60,14 +60,14 @@ def test_a_right_map_stays_and_its_views_are_not_touched() -> None:
 
 
 def test_a_wrong_map_does_not_stay() -> None:
-    opinion, log = second_opinion()
+    opinion, log = opinion_and_log()
     assert not opinion.stands(tracked(wrong()), "two views")
     assert log.events == []
 
 
 def test_nothing_is_said_for_a_map_where_no_other_can_start() -> None:
     still = np.repeat(TRUTH[:1], FRAMES, axis=0)
-    opinion, log = second_opinion()
+    opinion, log = opinion_and_log()
     assert not opinion.stands(tracked(still, still), "two views")
     assert log.events == []
 
@@ -114,7 +114,7 @@ def test_poses_without_common_frames_or_without_a_path_tell_nothing() -> None:
 @pytest.mark.parametrize("former", [TRUTH, wrong()])
 def test_a_dropped_map_is_cleared_if_the_next_has_its_poses(former: Float64, *, poses_contradicted: bool) -> None:
     kind = "checked again" if former is TRUTH else "contradiction"
-    opinion, log = second_opinion()
+    opinion, log = opinion_and_log()
     opinion.drop(tracked(former), "a logo", poses_contradicted=poses_contradicted)
     assert log.events == [], "it is told once the next map has started"
     cleared = opinion.on_dropped(tracked(TRUTH))
@@ -126,14 +126,14 @@ def test_a_dropped_map_is_cleared_if_the_next_has_its_poses(former: Float64, *, 
 def test_a_map_whose_poses_nothing_contradicted_is_cleared_by_the_tracks() -> None:
     """The next map is worse. Two views that contradicted the first may have been right all the same."""
     for poses_contradicted in (False, True):
-        opinion, log = second_opinion()
+        opinion, log = opinion_and_log()
         opinion.drop(tracked(TRUTH), "a logo", poses_contradicted=poses_contradicted)
         assert opinion.on_dropped(tracked(wrong())) == (not poses_contradicted)
         assert log.events[0].kind == ("contradiction" if poses_contradicted else "checked again")
 
 
 def test_a_dropped_map_that_nothing_follows_was_contradicted() -> None:
-    opinion, log = second_opinion()
+    opinion, log = opinion_and_log()
     opinion.drop(tracked(TRUTH), "a logo", poses_contradicted=False)
     assert not opinion.on_dropped([])
     assert [event.kind for event in log.events] == ["contradiction"]
@@ -143,7 +143,7 @@ def test_a_dropped_map_that_nothing_follows_was_contradicted() -> None:
 def test_two_views_with_two_motions_give_up_no_map(
     monkeypatch: pytest.MonkeyPatch, reason: str, *, stays: bool
 ) -> None:
-    monkeypatch.setattr(second_map, "start_map", lambda *_: InitFailure(reason))
-    opinion, log = second_opinion()
+    monkeypatch.setattr(second_opinion, "start_map", lambda *_: InitFailure(reason))
+    opinion, log = opinion_and_log()
     assert opinion.stands(tracked(TRUTH), "two views") == opinion.undecided == stays
     assert [event.kind for event in log.events] == ["checked again"] * stays
