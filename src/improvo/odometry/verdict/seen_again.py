@@ -21,8 +21,7 @@ from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.odometry.gates import FEWEST, LARGE_PART
 from improvo.odometry.verdict.evidence_window import EvidenceKeyframe
-from improvo.odometry.view import Mask
-from improvo.types import Float64
+from improvo.types import Float64, Mask
 
 _MARGIN = 0.03  # of the picture's width: nearer to its border, frontends find no keypoints
 _FEWEST_EXPECTED = 2 * FEWEST  # by both keyframes together
