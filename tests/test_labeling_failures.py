@@ -16,7 +16,7 @@ import pytest
 from rendered_walk import write_walk
 
 from improvo.errors import InputError, OutputError
-from improvo.labeling import label_sequences as labeling
+from improvo.labeling import label_job as labeling
 from improvo.labeling.frames import FramesTable, PackedImages, pack_images, read_frames, write_frames
 from improvo.labeling.label_sequences import fingerprint, label_sequences
 from improvo.labeling.store import DONE, FAILED, LabelStore, read_records

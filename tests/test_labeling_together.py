@@ -14,6 +14,7 @@ from rendered_walk import write_walk
 from improvo.cli.main import main
 from improvo.errors import OutputError
 from improvo.folder_lock import claimed, locked
+from improvo.labeling import label_job
 from improvo.labeling import label_sequences as module
 from improvo.labeling.label_sequences import label_sequences
 from improvo.labeling.store import DONE, LabelStore, SequenceRecord, lock_of, read_records
@@ -79,15 +80,15 @@ def test_a_sequence_that_another_process_labels_is_waited_for(
     monkeypatch.setattr(module, "_POLL_SECONDS", 0.01)
     done: list[str] = []
 
-    def label(job: module.LabelJob, tick: object) -> SequenceRecord:
+    def label(job: label_job.LabelJob, tick: object) -> SequenceRecord:
         done.append(job.name)
         return SequenceRecord(job.name, str(job.path), DONE, stable=1)
 
-    def labelled(job: module.LabelJob, tick: object) -> SequenceRecord:
+    def labelled(job: label_job.LabelJob, tick: object) -> SequenceRecord:
         job.folder.mkdir()
         return label(job, tick)
 
-    monkeypatch.setattr(module, "_labeled", labelled)
+    monkeypatch.setattr(label_job, "_labeled", labelled)
     store = tmp_path / "labels"
     LabelStore(store, module.fingerprint(LabelRunSettings(), False), kind=LabelRunSettings)
     holder = hold(lock_of(store, "attic"))

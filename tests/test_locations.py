@@ -19,7 +19,7 @@ from improvo.files import write_text
 from improvo.folder_lock import locked, seems_held
 from improvo.frontend.settings import FrontendSettings
 from improvo.labeling import label_sequences as label_module
-from improvo.labeling.label_sequences import LabelJob, label_sequence
+from improvo.labeling.label_job import LabelJob, label_sequence
 from improvo.labeling.labeled import read_labels
 from improvo.locations import claim, fetched, local_folder, place, publish, with_urls
 from improvo.odometry.run_settings import LabelRunSettings

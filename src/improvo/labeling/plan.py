@@ -21,7 +21,8 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.jobs.processes import Tick, run_in_processes
-from improvo.labeling.label_sequences import LabelJob, fingerprint, label_sequence
+from improvo.labeling.label_job import LabelJob, label_sequence
+from improvo.labeling.label_sequences import fingerprint
 from improvo.labeling.store import DONE, LabelStore
 from improvo.odometry.run_settings import RunSettings
 
