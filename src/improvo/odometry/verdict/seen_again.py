@@ -7,8 +7,8 @@ successive keyframes sees, and that lie in the picture of the other, are seen by
 those that it was chosen by. How many that are depends on the frontend, on noise and on what stands in between, so each
 gap is compared with the other gaps of its segment. A keyframe that sees little, in a flash or under a logo that was not
 known yet, is no leap: the little that it sees is seen from the other one, too, so of the two looks the better one
-counts; and of a blurred one those before and after it see the same again. Photographs that are taken from far apart tell nothing: from another
-side, things look otherwise and hide others.
+counts; and of a blurred one those before and after it see the same again. Photographs that are taken from far apart
+tell nothing: from another side, things look otherwise and hide others.
 """
 
 from __future__ import annotations
