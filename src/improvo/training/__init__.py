@@ -18,7 +18,7 @@ What they are made of, a folder each:
 
 What they share:
     `settings`, `held_settings`, `setting_checks`              all numbers; importable without torch
-    `trainer`, `metrics`, `stage_folder`                       the loop, its rows of figures, its output folder
+    `trainer`, `metrics`, `output_folder`                      the loop, its rows of figures, its output folder
     `device`, `distributed`, `shared_statistics`               one device; several processes under `torchrun`
     `networks`, `widen`, `interpolated_weights`                the network at the start; weights part of the way
 """

@@ -22,7 +22,7 @@ from improvo.training.data.posed_sequence import PosedSequence
 from improvo.training.device import choose_device, choose_precision
 from improvo.training.held_settings import HeldSettings
 from improvo.training.networks import started_network
-from improvo.training.stage_folder import model_card, not_stated, run_stage
+from improvo.training.output_folder import model_card, not_stated, run_stage
 from improvo.training.stages.held import HeldStage
 from improvo.training.trainer import Batches
 

@@ -23,8 +23,8 @@ from improvo.training.batches.posed_frames import PosedFrames
 from improvo.training.data.posed_sequence import PosedSequence, overlapping_pairs
 from improvo.training.held_settings import DevicePairSettings
 from improvo.training.metrics import METRICS, append_metrics, read_metrics
+from improvo.training.output_folder import SETTINGS, WEIGHTS, commit_of_code, learned_from, not_stated, stage_folder
 from improvo.training.settings import PhotometricSettings, ViewSettings
-from improvo.training.stage_folder import SETTINGS, WEIGHTS, commit_of_code, learned_from, not_stated, stage_folder
 from improvo.training.stages.descriptor_metric import MetricSettings, Scatter, found_again, with_descriptor_map
 from improvo.types import Features, Float64, Int64, Mask, UInt8
 

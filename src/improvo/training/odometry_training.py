@@ -14,8 +14,8 @@ from improvo.frontend.weights import DataSource, load_weights
 from improvo.training.batches.homography_pairs import PairBatches
 from improvo.training.data.pictures import load_pictures
 from improvo.training.networks import started_network
+from improvo.training.output_folder import model_card, not_stated, run_stage, stage_folder
 from improvo.training.settings import HomographiesSettings, OdometryTrainingSettings
-from improvo.training.stage_folder import model_card, not_stated, run_stage, stage_folder
 from improvo.training.superpoint_training import adapted_labels
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from improvo.training.data.pictures import Pictures, load_pictures
 from improvo.training.data.point_labels import PointLabels, load_labels, save_labels
 from improvo.training.device import choose_device
 from improvo.training.networks import first_network, published_architecture
+from improvo.training.output_folder import model_card, not_stated, run_stage, stage_folder
 from improvo.training.settings import HomographiesSettings, ShapesSettings
-from improvo.training.stage_folder import model_card, not_stated, run_stage, stage_folder
 from improvo.training.stages.superpoint import JointStage, MagicPointStage
 
 LABELS = "labels.npz"
