@@ -15,6 +15,9 @@ from improvo.errors import ConfigError
 def choose_device(name: str) -> torch.device:
     """`auto` is CUDA where there is one.
 
+    Args:
+        name: `auto`, or a device as torch names it.
+
     Raises:
         ConfigError: CUDA asked for where torch sees none.
     """
@@ -24,7 +27,12 @@ def choose_device(name: str) -> torch.device:
 
 
 def choose_precision(name: str, device: torch.device) -> torch.dtype:
-    """`auto` is bfloat16 on processors that multiply it natively; elsewhere it would be emulated, and slow."""
+    """`auto` is bfloat16 on processors that multiply it natively; elsewhere it would be emulated, and slow.
+
+    Args:
+        name: `auto`, `float32` or `bfloat16`.
+        device: that computes.
+    """
     if name == "auto":
         capable = (
             torch.cuda.is_bf16_supported() if device.type == "cuda" else torch.ops.mkldnn._is_mkldnn_bf16_supported()
