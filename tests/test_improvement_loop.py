@@ -152,7 +152,7 @@ def test_other_settings_are_refused_and_what_a_kill_left_is_cleared_away(
     assert not any(leftover.exists() for leftover in leftovers)
 
 
-def test_a_folder_that_was_begun_when_a_fifth_was_the_default_goes_on_with_its_split(walk: Path, tmp_path: Path) -> None:
+def test_a_folder_begun_when_a_fifth_was_the_default_goes_on_with_its_split(walk: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     begun = replace(SETTINGS, split=SplitSettings(0.2))
     run(out, [walk], FakeTraining(), 1, settings=begun)
