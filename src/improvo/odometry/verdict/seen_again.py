@@ -5,9 +5,10 @@ Its reprojection errors are small, since only what agrees is kept, and so are th
 evidence make. But a pose also says what else must be in the picture. At the right place most points that either of two
 successive keyframes sees, and that lie in the picture of the other, are seen by the other, too; at a wrong one only
 those that it was chosen by. How many that are depends on the frontend, on noise and on what stands in between, so each
-gap is compared with the other gaps of its segment. A single keyframe that sees little, blurred or in a flash, is no
-leap: those before and after it see the same again. Photographs that are taken from far apart tell nothing: from another
-side, things look otherwise and hide others.
+gap is compared with the other gaps of its segment. A keyframe that sees little, in a flash or under a logo that was not
+known yet, is no leap: the little that it sees is seen from the other one, too, so of the two looks the better one
+counts; and of a blurred one those before and after it see the same again. Photographs that are taken from far apart
+tell nothing: from another side, things look otherwise and hide others.
 """
 
 from __future__ import annotations
@@ -19,23 +20,23 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.odometry.gates import FEWEST, LARGE_PART
+from improvo.odometry.gates import FEWEST
 from improvo.odometry.verdict.evidence_window import EvidenceKeyframe
 from improvo.types import Float64, Mask
 
 _MARGIN = 0.03  # of the picture's width: nearer to its border, frontends find no keypoints
-_FEWEST_EXPECTED = 2 * FEWEST  # by both keyframes together
+_HALF = 0.5  # of the usual share: right segments have .51 and more, but for one in 112
 _FEW_GAPS = 6  # fewer tell nothing of what is usual
 _FAR_APART_DEG = 5.0  # usual parallax between keyframes: 1 to 3 in videos, 11 in photographs around a thing
 
 
 @dataclass(frozen=True)
 class SeenAgain:
-    """What two keyframes see of each other's points, across a gap between two successive ones.
+    """What one keyframe sees of another one's points, across a gap between two successive ones.
 
     Attributes:
         frames: of the two successive ones.
-        expected: observations of either that lie in the picture of the other.
+        expected: observations of the one that lie in the picture of the other.
         found: of these, those whose point the other observes.
         parallax_deg: angle between the rays from both to what is expected, median.
     """
@@ -46,18 +47,23 @@ class SeenAgain:
     parallax_deg: float = 0.0
 
     @property
+    def tells(self) -> bool:
+        """Whether enough is expected for a share."""
+        return self.expected >= FEWEST
+
+    @property
     def share(self) -> float:
         """Of what is expected, what is found; 0 where nothing is expected."""
         return self.found / max(self.expected, 1)
 
     def or_better(self, other: SeenAgain) -> SeenAgain:
-        """Of two looks across this gap the one that finds the larger share."""
-        better = other.expected >= _FEWEST_EXPECTED and other.share > self.share
-        return replace(self, expected=other.expected, found=other.found) if better else self
+        """Of two looks across this gap the one that finds the larger share, if it tells."""
+        better = other.tells and (not self.tells or other.share > self.share)
+        return replace(other, frames=self.frames) if better else self
 
 
 def seen_again(before: EvidenceKeyframe, after: EvidenceKeyframe, xyz: Float64, camera: Camera) -> SeenAgain:
-    """What two keyframes see of each other's points.
+    """What two keyframes see of each other's points; of both looks the one that finds the larger share.
 
     Args:
         before: the earlier one.
@@ -65,17 +71,15 @@ def seen_again(before: EvidenceKeyframe, after: EvidenceKeyframe, xyz: Float64, 
         xyz: (P, 3) points of the map.
         camera: pinhole, of both.
     """
-    expected = found = 0
-    parallax = [np.zeros(0)]
+    frames = before.frame_index, after.frame_index
     centers = [se3.inverse(keyframe.cam_from_world)[:3, 3] for keyframe in (before, after)]
+    looks = []
     for seer, other in ((before, after), (after, before)):
         points = seer.points[_inside(se3.transform(other.cam_from_world, xyz[seer.points]), camera)]
-        expected += len(points)
-        found += int(np.isin(points, other.points).sum())
-        parallax.append(_angle_deg(xyz[points] - centers[0], xyz[points] - centers[1]))
-    angles = np.concatenate(parallax)
-    median = float(np.median(angles)) if len(angles) else 0.0
-    return SeenAgain((before.frame_index, after.frame_index), expected, found, median)
+        angles = _angle_deg(xyz[points] - centers[0], xyz[points] - centers[1])
+        parallax = float(np.median(angles)) if len(angles) else 0.0
+        looks.append(SeenAgain(frames, len(points), int(np.isin(points, other.points).sum()), parallax))
+    return looks[0].or_better(looks[1])
 
 
 def looked_again(gaps: list[SeenAgain], keyframes: Sequence[EvidenceKeyframe], xyz: Float64, camera: Camera) -> None:
@@ -96,16 +100,16 @@ def looked_again(gaps: list[SeenAgain], keyframes: Sequence[EvidenceKeyframe], x
 
 
 def leaps(gaps: Sequence[SeenAgain]) -> tuple[SeenAgain, ...]:
-    """Gaps across which much less is seen again than is usual in their segment, in temporal order.
+    """Gaps across which less than half is seen again of what is usual in their segment, in temporal order.
 
     Args:
         gaps: of a segment, those between all successive keyframes.
     """
-    telling = [gap for gap in gaps if gap.expected >= _FEWEST_EXPECTED]
+    telling = [gap for gap in gaps if gap.tells]
     if len(telling) < _FEW_GAPS or np.median([gap.parallax_deg for gap in telling]) > _FAR_APART_DEG:
         return ()
     usual = float(np.median([gap.share for gap in telling]))
-    return tuple(gap for gap in telling if gap.share < LARGE_PART * usual)
+    return tuple(gap for gap in telling if gap.share < _HALF * usual)
 
 
 def _inside(in_camera: Float64, camera: Camera) -> Mask:
