@@ -129,7 +129,7 @@ class Rounds:
             with self._progress.bar(f"depth of the reference, {kind}", "frame") as tick:
                 self._crew.results(do_depth_job, jobs, tick)
             found.append(parts)
-        mend = "record with a camera that moves sideways, or hold back other recordings with --evaluate"
+        mend = "record longer, with a camera that moves sideways, or hold back other recordings with --evaluate"
         refuse_without_depth(found[0], "the training part", mend)
         more = ", or more of this one with --set split.share=0.5 and another -o" if len(paths) == 1 else ""
         refuse_without_depth(found[1], "what is held back", mend + more)
