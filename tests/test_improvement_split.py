@@ -9,7 +9,8 @@ import pytest
 from rendered_walk import write_walk
 
 from improvo.errors import ConfigError, InputError
-from improvo.improvement.settings import SplitSettings
+from improvo.improvement.plan import first_estimate
+from improvo.improvement.settings import ImproveSettings, SplitSettings
 from improvo.improvement.split import (
     frames_there,
     remembered_split,
@@ -103,6 +104,9 @@ def test_pictures_that_are_named_but_absent_do_not_count(walk: Path, tmp_path: P
     assert training.present.tolist() == [*range(1, 10), *range(12, 21)]
     assert held_back.indices.tolist() == held_back.present.tolist() == list(range(21, 30))
     assert frames_there(copy, replace(how, stride=2)) == 13
+    _, needed = first_estimate([copy], ImproveSettings(sequence=how), rounds=1)
+    assert needed is not None
+    assert needed.labeled_frames == 27 + 2 * 9  # what is held back again, by the start and by the round
 
 
 @pytest.mark.parametrize(
