@@ -25,7 +25,7 @@ from improvo.frontend.weights import load_weights
 from improvo.improvement.decision import rule, why_not_better
 from improvo.improvement.improve import Improvement
 from improvo.improvement.progress import ImprovementProgress
-from improvo.improvement.settings import ImproveSettings, ValidationSettings
+from improvo.improvement.settings import ImproveSettings, SplitSettings, ValidationSettings
 from improvo.improvement.validation import GapScores, Validation, gain, read_validation, summary
 from improvo.labeling.labeled import read_labels
 
@@ -150,6 +150,22 @@ def test_other_settings_are_refused_and_what_a_kill_left_is_cleared_away(
     free = replace(SETTINGS.held, optimiser=replace(SETTINGS.held.optimiser, threads=1, log_every=3))
     run(out, [walk], FakeTraining(), settings=replace(SETTINGS, held=free))
     assert not any(leftover.exists() for leftover in leftovers)
+
+
+def test_a_folder_begun_when_a_fifth_was_the_default_goes_on_with_its_split(walk: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    begun = replace(SETTINGS, split=SplitSettings(0.2))
+    run(out, [walk], FakeTraining(), 1, settings=begun)
+    split = (out / "split.json").read_bytes()
+    values = yaml.safe_load((out / "settings.yaml").read_text())
+    del values["split"]["least_frames"]  # as it was then
+    (out / "settings.yaml").write_text(yaml.safe_dump(values))
+    for _ in range(2):
+        run(out, [walk], FakeTraining(), 1, settings=replace(SETTINGS, split=SplitSettings()))
+        assert (out / "split.json").read_bytes() == split
+    run(out, [walk], FakeTraining(), 1, settings=begun)
+    with pytest.raises(ConfigError, match=r"begun with split.share=0.2, now 0.3"):
+        run(out, [walk], FakeTraining(), 1)
 
 
 def test_a_folder_of_a_former_version_is_refused_for_what_it_is(

@@ -30,7 +30,7 @@ from improvo.improvement.reference import (
     reference_parts,
     refuse_without_depth,
 )
-from improvo.improvement.settings import METRIC, TRACKS, ImproveSettings, ReferenceSettings
+from improvo.improvement.settings import METRIC, TRACKS, ImproveSettings, ReferenceSettings, SplitSettings
 from improvo.improvement.split import Split, split_last_part
 from improvo.labeling.label_sequences import label_sequences
 from improvo.labeling.labeled import LabeledSequence
@@ -46,7 +46,7 @@ def labelled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Split]:
     walk = write_walk(folder / "room", frames=40, seed=3)
     frontend = FrontendSettings("superpoint-small", max_keypoints=250)
     label_sequences([walk], folder / "store", SETTINGS.run_settings(SequenceSettings(), frontend))
-    return folder / "store", split_last_part(walk, SequenceSettings(), 0.3)
+    return folder / "store", split_last_part(walk, SequenceSettings(), SplitSettings(0.3))
 
 
 def parts_of(labelled: tuple[Path, Split], kind: str) -> ReferencePart:

@@ -63,7 +63,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="SEQUENCE",
-        help="held out for validation (default: one sequence in five, or the last fifth of a single one)",
+        help="held out for validation (default: one sequence in five, or of a single one the last fifth, of a short "
+        "one 60 frames or a third)",
     )
     parser.add_argument(
         "--after",

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from improvo import config
-from improvo.continuation import SettingsRecord
+from improvo.continuation import SettingsRecord, value_of
 from improvo.errors import ConfigError
 from improvo.files import check_output_folder, content_hash, make_output_folder
-from improvo.improvement.settings import ImproveSettings
+from improvo.improvement.settings import USUAL_SHARE, ImproveSettings
 from improvo.locations import removed
 from improvo.sequences.given_files import CONTENTS, contents_of_given
 
@@ -171,6 +171,9 @@ class ImproveFolder:
         record = SettingsRecord(self.folder / "settings.yaml", ImproveSettings, free, CONTENTS)
         if self.split.is_file():
             self._refuse_former(record)
+            recorded = value_of("split.share", record.read())
+            if recorded == USUAL_SHARE and values["split"]["share"] is None:  # it was the default; the split is made
+                values["split"]["share"] = recorded
             record.check(values, "give the same again, or another output folder")
         elif record.difference(values):  # nothing has come of it yet
             for folder in (self.reference, self.start.folder):

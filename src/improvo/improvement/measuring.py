@@ -68,7 +68,7 @@ def validate(
     if all(entry.earlier for entry in scores):
         raise InputError(
             "what is held back has no pair of frames with poses and depth; hold back a longer or livelier recording "
-            "with --evaluate, or more of this one with --set split.share=0.33 and another -o"
+            "with --evaluate, or more of this one with --set split.share=0.5 and another -o"
         )
     labelled = read_labels(candidate.held_back) if any(record.state == DONE for record in records) else []
     gaps = tuple(sorted({entry.gap for entry in scores if not entry.earlier}))

@@ -15,7 +15,7 @@ from improvo.improvement.estimate import Costs, Estimate, estimate
 from improvo.improvement.plan_sample import measure
 from improvo.improvement.rounds import starting_weights
 from improvo.improvement.settings import ImproveSettings
-from improvo.improvement.split import whole_held_back
+from improvo.improvement.split import frames_there, whole_held_back
 from improvo.labeling.plan import LabelPlan, plan_labels
 from improvo.sequences import open_sequence
 
@@ -72,8 +72,10 @@ def plan_improvement(
         once = plan_labels(paths, run_settings, on_frames=on_frames, folder=store)
         costs = Costs.usual(pixels, _parameters(weights))
         measured = measure(store, weights, settings, replace(costs, frame=once.frame_seconds))
-    held_back = round(once.frames * (len(evaluate) / len(paths) if evaluate else settings.split.share))
-    whole = len(evaluate) or whole_held_back(len(paths), settings.split.share)
+    held_back = (
+        round(once.frames * len(evaluate) / len(paths)) if evaluate else _held_back(once.frames, len(paths), settings)
+    )
+    whole = len(evaluate) or whole_held_back(len(paths), settings.split)
     training = once.frames - held_back
     needed = estimate(settings, rounds, training, held_back, pixels, measured or costs, whole)
     return ImprovePlan(once, needed, rounds, measured is not None)
@@ -95,18 +97,18 @@ def first_estimate(
     training = held_back = 0
     for path in dict.fromkeys([*sequences, *evaluate]):
         with suppress(InputError):
-            frames = open_sequence(path, settings.sequence).length or 0
+            frames = frames_there(path, settings.sequence)
             held_back += frames if path.resolve() in named else 0
             training += 0 if path.resolve() in named else frames
     if not evaluate:
-        held_back = round(training * settings.split.share)
+        held_back = _held_back(training, len(sequences), settings)
         training -= held_back
     if training + held_back == 0:
         return rounds or 1, None
     paths = [*sequences, *evaluate]
     pixels = _pixels(paths, settings)
     costs = Costs.usual(pixels, _parameters(starting_weights(settings.frontend.name)))
-    whole = len(evaluate) or whole_held_back(len(paths), settings.split.share)
+    whole = len(evaluate) or whole_held_back(len(paths), settings.split)
 
     def needed(settings: ImproveSettings, rounds: int) -> Estimate:
         return estimate(settings, rounds, training, held_back, pixels, costs, whole)
@@ -128,6 +130,13 @@ def usual_rounds(settings: ImproveSettings, needed: Callable[[ImproveSettings, i
     settings = replace(settings, control=False)
     minutes = [needed(settings, rounds).minutes for rounds in range(1, _MOST_ROUNDS + 1)]
     return sum(each <= max(_USUAL_MINUTES, _AND_A_HALF * minutes[0]) for each in minutes)
+
+
+def _held_back(frames: int, recordings: int, settings: ImproveSettings) -> int:
+    """Frames of all recordings that are held back, where the user names none."""
+    return (
+        settings.split.frames_of_one(frames) if recordings == 1 else round(settings.split.share_of_sequences * frames)
+    )
 
 
 def _parameters(weights: Path) -> int:

@@ -221,7 +221,7 @@ def _notes(
             notes.append(
                 f"Only {start.pairs(level)} pairs of frames held back are {start.gap_words(level)} apart, and all look "
                 "at much the same: believe little of what is said of them. Hold back more, with --evaluate or "
-                "--set split.share=0.33 in another folder."
+                "--set split.share=0.5 in another folder."
             )
     notes += [f"Left out: {reason}" for reason in split.unusable]
     for candidate, validation in zip(candidates, validations, strict=True):

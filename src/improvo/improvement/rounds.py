@@ -27,10 +27,11 @@ from improvo.improvement.reference import (
     reference_parts,
     refuse_without_depth,
 )
-from improvo.improvement.settings import TRACKS, ImproveSettings
+from improvo.improvement.settings import TRACKS, ImproveSettings, SplitSettings
 from improvo.improvement.split import (
     Part,
     Split,
+    frames_there,
     remembered_split,
     share_labels,
     split_as_named,
@@ -84,13 +85,13 @@ class Rounds:
             evaluate: those of them, or others, that the user wants to be held back; may be none.
             weights_file: of the frontend that labels several sequences.
         """
-        how, share = self._settings.sequence, self._settings.split.share
+        how, settings = self._settings.sequence, self._settings.split
 
         def choose() -> Split:
             if evaluate:
                 return split_as_named(sequences, evaluate, how)
             return (
-                split_last_part(sequences[0], how, share)
+                split_last_part(sequences[0], how, settings)
                 if len(sequences) == 1
                 else self._survey(sequences, weights_file)
             )
@@ -128,9 +129,9 @@ class Rounds:
             with self._progress.bar(f"depth of the reference, {kind}", "frame") as tick:
                 self._crew.results(do_depth_job, jobs, tick)
             found.append(parts)
-        mend = "record with a camera that moves sideways, or hold back other recordings with --evaluate"
+        mend = "record longer, with a camera that moves sideways, or hold back other recordings with --evaluate"
         refuse_without_depth(found[0], "the training part", mend)
-        more = ", or more of this one with --set split.share=0.33 and another -o" if len(paths) == 1 else ""
+        more = ", or more of this one with --set split.share=0.5 and another -o" if len(paths) == 1 else ""
         refuse_without_depth(found[1], "what is held back", mend + more)
         return found[0], found[1]
 
@@ -233,9 +234,9 @@ class Rounds:
     def _survey(self, sequences: Sequence[Path], weights_file: Path) -> Split:
         """Label all sequences whole, then hold back some of those that have labels."""
         settings = self._settings
-        candidate = self.start(weights_file, _readable_beginning(sequences, settings.sequence, settings.split.share))
+        candidate = self.start(weights_file, _readable_beginning(sequences, settings.sequence, settings.split))
         records = self._label(candidate, list(sequences), settings.sequence, self._folder.reference, "all sequences")
-        return split_whole_sequences(records, settings.sequence, settings.split.share)
+        return split_whole_sequences(records, settings.sequence, settings.split)
 
     def _label(
         self, candidate: Candidate, paths: list[Path], how: SequenceSettings, store: Path, what: str
@@ -268,7 +269,7 @@ class _TrainThere:
 def _length(path: Path, how: SequenceSettings) -> int:
     """Frames to come, for the progress bar."""
     with suppress(InputError):
-        return open_sequence(path, how).length or 0
+        return frames_there(path, how)
     return 0
 
 
@@ -285,7 +286,7 @@ def _refuse_unwritten(records: list[SequenceRecord]) -> list[SequenceRecord]:
     return records
 
 
-def _readable_beginning(sequences: Sequence[Path], how: SequenceSettings, share: float) -> Part:
+def _readable_beginning(sequences: Sequence[Path], how: SequenceSettings, settings: SplitSettings) -> Part:
     """Frames that will never be held back, whichever sequences are: the beginning of the first that can be read.
 
     Raises:
@@ -293,8 +294,8 @@ def _readable_beginning(sequences: Sequence[Path], how: SequenceSettings, share:
     """
     for path in sequences[:-1]:
         with suppress(InputError):
-            return split_last_part(path, how, share).training
-    return split_last_part(sequences[-1], how, share).training
+            return split_last_part(path, how, settings).training
+    return split_last_part(sequences[-1], how, settings).training
 
 
 def starting_weights(name: str) -> Path:
@@ -340,7 +341,8 @@ def calibration_images(part: Part, count: int) -> list[UInt8]:
         except InputError:  # said when it is labelled
             continue
         wanted = max(1, round(count / len(part.paths)))
-        rows = np.unique(np.linspace(0, len(sequence) - 1, wanted).round().astype(int))
+        there = np.searchsorted(sequence.indices, sequence.present)
+        rows = there[np.unique(np.linspace(0, len(there) - 1, wanted).round().astype(int))]
         images += [image for row in rows if (image := _image(sequence, int(row))) is not None]
     if not images:
         raise InputError(f"{part.paths[0]}: none of its frames can be read; check the recording")

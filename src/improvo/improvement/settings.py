@@ -18,6 +18,7 @@ from improvo.training.stages.descriptor_metric import MetricSettings
 
 DEFAULT_START = "superpoint-small"  # on a CPU a step takes a quarter of the time of one of `superpoint`
 HELD, METRIC, TRACKS = "held", "metric", "tracks"
+USUAL_SHARE = 0.2  # that is held back
 RECIPES = (HELD, METRIC, TRACKS)
 
 
@@ -25,11 +26,29 @@ RECIPES = (HELD, METRIC, TRACKS)
 class SplitSettings:
     """What training never sees, so that the rounds can be validated on it."""
 
-    share: float = 0.2  # of the sequences, at least one; of a single sequence, its last part
+    # of the sequences, at least one; of a single sequence, its last part. Without it a fifth, and of a single one no
+    # fewer than `least_frames`, or a third where that is less
+    share: float | None = None
+    least_frames: int = (
+        60  # wide gaps are 20 to 90 frames; with fewer held back they have no pair, or ten of one second
+    )
 
     def __post_init__(self) -> None:
-        if not 0 < self.share < 1:
+        if self.share is not None and not 0 < self.share < 1:
             raise ConfigError(f"split.share={self.share}: must be between 0 and 1")
+        if self.least_frames < 0:
+            raise ConfigError(f"split.least_frames={self.least_frames}: must not be negative")
+
+    @property
+    def share_of_sequences(self) -> float:
+        """The share of the frames, or sequences, where there are several sequences."""
+        return USUAL_SHARE if self.share is None else self.share
+
+    def frames_of_one(self, frames: int) -> int:
+        """How many frames of a single sequence are held back; the rest must be enough to learn from."""
+        if self.share is not None:
+            return round(self.share * frames)
+        return max(round(USUAL_SHARE * frames), min(self.least_frames, frames // 3))
 
 
 @dataclass(frozen=True)

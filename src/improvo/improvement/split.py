@@ -11,6 +11,7 @@ from pathlib import Path
 from improvo import config
 from improvo.errors import ConfigError, InputError
 from improvo.files import MARKER, write_json
+from improvo.improvement.settings import SplitSettings
 from improvo.labeling.store import DONE, RECORD_FILE, SETTINGS_FILE, SequenceRecord, sequence_names
 from improvo.sequences import SequenceSettings, open_sequence
 from improvo.terminal import counted
@@ -55,13 +56,13 @@ def split_as_named(paths: Sequence[Path], evaluate: Sequence[Path], sequence: Se
     return Split(Part(tuple(rest), sequence), Part(tuple(held), sequence), _words(held))
 
 
-def split_last_part(path: Path, sequence: SequenceSettings, share: float) -> Split:
-    """The split of a single recording: its last frames are held back.
+def split_last_part(path: Path, sequence: SequenceSettings, settings: SplitSettings) -> Split:
+    """The split of a single recording: its last frames are held back, of those that are there.
 
     Args:
         path: of the recording.
         sequence: how it is read.
-        share: of its frames to hold back.
+        settings: how many of its frames to hold back.
 
     Raises:
         InputError: it cannot be opened, does not end, or has too few frames.
@@ -69,26 +70,31 @@ def split_last_part(path: Path, sequence: SequenceSettings, share: float) -> Spl
     opened = open_sequence(path, sequence)
     if opened.length is None:
         raise InputError(f"{path}: is a live stream; record it first")
-    cut = len(opened) - max(round(len(opened) * share), _MIN_FRAMES)
+    present = opened.present
+    cut = len(present) - max(settings.frames_of_one(len(present)), _MIN_FRAMES)
     if cut < _MIN_FRAMES:
         raise InputError(
-            f"{path}: has {counted(len(opened), 'frame')}, too few to train on some and validate on the others; "
+            f"{path}: has {counted(len(present), 'frame')}, too few to train on some and validate on the others; "
             "give a longer recording, some seconds at least, or several"
         )
-    first_held, last = int(opened.indices[cut]), int(opened.indices[-1])
+    first_held, last = int(present[cut]), int(present[-1])
     training = replace(sequence, end=first_held, max_frames=None)
     held_back = replace(sequence, start=first_held, end=last + 1, max_frames=None)
-    words = f"the last {len(opened) - cut} of {len(opened)} frames of {path.name}"
+    words = f"the last {len(present) - cut} of {len(present)} frames of {path.name}"
+    if len(present) < len(opened):
+        words += f" (of {len(opened)} that it lists)"
     return Split(Part((path.resolve(),), training), Part((path.resolve(),), held_back), words)
 
 
-def split_whole_sequences(records: Sequence[SequenceRecord], sequence: SequenceSettings, share: float) -> Split:
+def split_whole_sequences(
+    records: Sequence[SequenceRecord], sequence: SequenceSettings, settings: SplitSettings
+) -> Split:
     """The split of several recordings that were all labelled: whole ones are held back, evenly spread over the list.
 
     Args:
         records: of all of them, in the user's order; those that could not be labelled are in neither part.
         sequence: how they are read.
-        share: of those labelled to hold back.
+        settings: how many of those labelled to hold back.
 
     Raises:
         InputError: only one could be labelled, and it is too short to be divided.
@@ -96,17 +102,27 @@ def split_whole_sequences(records: Sequence[SequenceRecord], sequence: SequenceS
     unusable = tuple(f"{record.name}: {record.reason}" for record in records if record.state != DONE)
     paths = [Path(record.path) for record in records if record.state == DONE]
     if len(paths) == 1:
-        return replace(split_last_part(paths[0], sequence, share), unusable=unusable)
-    count = whole_held_back(len(paths), share)
+        return replace(split_last_part(paths[0], sequence, settings), unusable=unusable)
+    count = whole_held_back(len(paths), settings)
     chosen = {-(-len(paths) * (part + 1) // count) - 1 for part in range(count)}  # rounded up: never the first
     held = [path for row, path in enumerate(paths) if row in chosen]
     rest = [path for row, path in enumerate(paths) if row not in chosen]
     return Split(Part(tuple(rest), sequence), Part(tuple(held), sequence), _words(held), unusable)
 
 
-def whole_held_back(recordings: int, share: float) -> int:
+def frames_there(path: Path, sequence: SequenceSettings) -> int:
+    """How many frames a recording has, of those that it names; 0 of a live one.
+
+    Raises:
+        InputError: it cannot be opened.
+    """
+    opened = open_sequence(path, sequence)
+    return 0 if opened.length is None else len(opened.present)
+
+
+def whole_held_back(recordings: int, settings: SplitSettings) -> int:
     """How many of several recordings are held back; 0 of a single one, which is divided."""
-    return min(max(1, round(recordings * share)), recordings - 1)
+    return min(max(1, round(recordings * settings.share_of_sequences)), recordings - 1)
 
 
 def remembered_split(path: Path, choose: Callable[[], Split]) -> Split:

@@ -136,9 +136,9 @@ def _lengths(paths: Sequence[Path], settings: RunSettings) -> dict[Path, int]:
     lengths: dict[Path, int] = {}
     for row in np.unique(np.linspace(0, len(paths) - 1, _LOOKED_AT).round().astype(int)):
         with suppress(InputError):
-            length = open_sequence(paths[row], settings.sequence).length
-            if length:
-                lengths[paths[row]] = length
+            sequence = open_sequence(paths[row], settings.sequence)
+            if sequence.length and len(sequence.present):
+                lengths[paths[row]] = len(sequence.present)
     return lengths
 
 

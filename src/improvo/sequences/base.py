@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration
 from improvo.types import Float32, Float64, Trajectory, UInt8
@@ -94,6 +97,10 @@ class Recording(ABC):
             if calibration is not None:
                 return calibration
         return None
+
+    def present(self) -> NDArray[np.bool_]:
+        """(N,) whether there is a picture, as far as that is known without reading it: a list may name absent files."""
+        return np.ones(len(self), np.bool_)
 
     def depth(self, index: int) -> Float32 | None:
         """Depth in metres (H, W) registered to the raw image, NaN where missing; None where there is none."""

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files import load_calibration, parse_yaml
@@ -79,6 +80,9 @@ class EurocMav(Recording):
 
     def image(self, index: int) -> UInt8:
         return self._images.read(index)
+
+    def present(self) -> NDArray[np.bool_]:
+        return self._images.present()
 
 
 def _mav_folder(path: Path) -> Path | None:

@@ -15,6 +15,7 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, folder_calibration
@@ -68,6 +69,9 @@ class IclNuim(Recording):
 
     def image(self, index: int) -> UInt8:
         return self._images.read(index)
+
+    def present(self) -> NDArray[np.bool_]:
+        return self._images.present()
 
     def depth(self, index: int) -> Float32 | None:
         file = self._depth[index]

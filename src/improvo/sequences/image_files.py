@@ -9,11 +9,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.grey_levels import SAMPLES, Stretch, stretch_of, to_8_bits
-from improvo.sequences.images import decode, file_bytes
+from improvo.sequences.images import decode, file_bytes, is_file
 from improvo.types import UInt8
 from improvo.untrusted.paths import check_is_file, is_text
 
@@ -52,6 +53,10 @@ class ImageFiles:
 
     def __len__(self) -> int:
         return len(self.files)
+
+    def present(self) -> NDArray[np.bool_]:
+        """(N,) whether each file is there; none is read."""
+        return np.array([is_file(file) for file in self.files], np.bool_)
 
     def read(self, index: int) -> UInt8:
         """(H, W) grey or (H, W, 3) BGR, 8 bits.

@@ -186,10 +186,11 @@ def listed_file(folder: Path, name: str) -> Path:
     parts = [part for part in plain.split("/") if part not in ("", ".")]
     tails = ["/".join(parts[-count:]) for count in (len(parts), 3, 2, 1) if 0 < count <= len(parts)]
     candidates = [folder / name, folder / plain, *(folder / tail for tail in tails)]
-    return next((file for file in candidates if _is_file(file)), folder / plain)
+    return next((file for file in candidates if is_file(file)), folder / plain)
 
 
-def _is_file(path: Path) -> bool:
+def is_file(path: Path) -> bool:
+    """Whether there is such a file, whatever its name."""
     try:
         return path.is_file()
     except OSError:  # a name that is longer than any can be, or in a folder that may not be looked into

@@ -13,6 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, camera_of
@@ -74,6 +75,9 @@ class Nerfstudio(Recording):
 
     def image(self, index: int) -> UInt8:
         return self._images.read(index)
+
+    def present(self) -> NDArray[np.bool_]:
+        return self._images.present()
 
     def depth(self, index: int) -> Float32 | None:
         name = self._depth[index]

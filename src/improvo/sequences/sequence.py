@@ -106,6 +106,11 @@ class Sequence:
         """The number of selected frames; None where it is not known, because the recording is still going on."""
         return len(self.indices)
 
+    @cached_property
+    def present(self) -> Int64:
+        """(M,) those of `indices` whose picture is there, as far as that is known without reading it."""
+        return self.indices[self.recording.present()[self.indices]]
+
     def __len__(self) -> int:
         return len(self.indices)
 

@@ -10,6 +10,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, folder_calibration
@@ -69,6 +70,9 @@ class TumRgbd(Recording):
 
     def image(self, index: int) -> UInt8:
         return self._images.read(index)
+
+    def present(self) -> NDArray[np.bool_]:
+        return self._images.present()
 
     def depth(self, index: int) -> Float32 | None:
         row = self._depth_row[index]
