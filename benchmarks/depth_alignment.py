@@ -66,11 +66,11 @@ def _pair(case: Case, maps: Maps, a: int, b: int) -> tuple[np.ndarray, ...] | No
     """Share of the corners seen; of those certain, contradicted, own and true to picture, truth to own and moved."""
     import torch
 
-    from improvo.training.alignment import aligned
+    from improvo.training.batches.alignment import aligned
+    from improvo.training.batches.picture_store import PictureStore
+    from improvo.training.batches.posed_frames import PosedFrames
+    from improvo.training.data.posed_sequence import PosedSequence
     from improvo.training.held_settings import AlignmentSettings
-    from improvo.training.picture_store import PictureStore
-    from improvo.training.posed import PosedSequence
-    from improvo.training.posed_frames import PosedFrames
 
     poses = case.cam_from_world[[a, b]], case.truth.cam_from_world[[a, b]]
     if a not in maps or b not in maps or not np.isfinite(poses).all() or case.segment[a] != case.segment[b]:

@@ -1,4 +1,7 @@
-"""Mean average precision of detectors on drawn shapes with noise: python benchmarks/detector.py [WEIGHTS ...]"""
+"""Mean average precision of detectors on drawn shapes with noise.
+
+PYTHONPATH=tests python benchmarks/detector.py [WEIGHTS ...]
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,9 @@ import argparse
 import numpy as np
 
 from improvo.frontend.network import load_network_frontend
-from improvo.training.precision import ScoredDetector, classical_detectors, mean_average_precision, shape_tests
 from improvo.training.settings import PhotometricSettings
 from improvo.types import Float32, UInt8
+from shape_detection import ScoredDetector, classical_detectors, mean_average_precision, shape_tests
 
 
 def network(name: str, keypoints: int = 100) -> ScoredDetector:

@@ -80,10 +80,10 @@ def one_training(store: Path, output: Path, steps: int, frontend: str) -> dict[s
 
     from improvo.frontend.weights import find_weights
     from improvo.labeling.labeled import read_labels
-    from improvo.training.label_library import LabelLibrary
+    from improvo.training.batches.tracked_pairs import TrackedPairs
+    from improvo.training.data.label_library import LabelLibrary
+    from improvo.training.odometry_training import train_odometry
     from improvo.training.settings import OdometryTrainingSettings, OptimiserSettings
-    from improvo.training.stages import train_odometry
-    from improvo.training.tracked_pairs import TrackedPairs
     from improvo.training.trainer import Trainer
 
     settings = OdometryTrainingSettings(optimiser=OptimiserSettings(steps=steps, log_every=5))

@@ -25,9 +25,9 @@ from improvo.frontend.network import load_network_frontend, prepare
 from improvo.frontend.runtime_torch import load_network
 from improvo.frontend.superpoint import SuperPoint, sample_descriptors
 from improvo.frontend.weights import find_weights, load_weights, save_weights
-from improvo.training.losses import held_loss
-from improvo.training.pack import read_pack
-from improvo.training.trainer import choose_precision
+from improvo.training.data.pack import read_pack
+from improvo.training.device import choose_precision
+from improvo.training.stages.losses import held_loss
 from improvo.types import Float64, UInt8
 
 KEYPOINTS = 500

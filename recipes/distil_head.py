@@ -25,7 +25,7 @@ from improvo.frontend.runtime_torch import load_network
 from improvo.frontend.superpoint import SuperPoint
 from improvo.frontend.weights import find_weights, load_weights, save_weights
 from improvo.simulation.causes import Cause
-from improvo.training.pack import read_pack
+from improvo.training.data.pack import read_pack
 from improvo.types import Float64, UInt8
 
 CELLS = 14_400  # of the frames of a step, which are all of one size: 12 of 320×240

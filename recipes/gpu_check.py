@@ -20,14 +20,15 @@ from improvo.frontend.channel_pruning import without_dead_channels
 from improvo.frontend.runtime_torch import load_network
 from improvo.frontend.superpoint import heat_map
 from improvo.frontend.weights import find_weights, load_weights
-from improvo.training.device_pairs import DevicePairs
-from improvo.training.held import HeldStage
+from improvo.training.batches.device_pairs import DevicePairs
+from improvo.training.batches.teacher import network_teacher
+from improvo.training.data.pack import read_pack
+from improvo.training.data.pictures import Pictures
+from improvo.training.device import choose_device
 from improvo.training.held_settings import HeldSettings
 from improvo.training.metrics import METRICS, read_metrics
-from improvo.training.pack import read_pack
-from improvo.training.pictures import Pictures
-from improvo.training.teacher import network_teacher
-from improvo.training.trainer import Trainer, choose_device
+from improvo.training.stages.held import HeldStage
+from improvo.training.trainer import Trainer
 
 # largest difference of a heat map, and of 1 - cosine of a descriptor (99th percentile), from the CPU in float32
 TOLERANCE = {torch.float32: (2e-3, 1e-4), torch.bfloat16: (0.15, 5e-3)}

@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from improvo.cli.train_options import read_data_card
 from improvo.simulation.causes import Cause
-from improvo.training.pack import write_pack
-from improvo.training.pictures import Pictures, Source, load_pictures
-from improvo.training.posed import PosedSequence, block_inverse_depth
+from improvo.training.data.pack import write_pack
+from improvo.training.data.pictures import Pictures, Source, load_pictures
+from improvo.training.data.posed_sequence import PosedSequence, block_inverse_depth
 
 HERE = Path(__file__).parent
 # folder or video of PICTURES -> (every so manieth picture, weight beside the square root of the number)

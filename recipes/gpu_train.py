@@ -43,9 +43,9 @@ def run_job(job: dict[str, Any], plan: dict[str, Any], arguments: argparse.Names
     """Wait for the weights that the job starts from, and train."""
     import torch
 
+    from improvo.training.data.pack import read_pack
+    from improvo.training.data.pictures import Pictures
     from improvo.training.held_training import train_held
-    from improvo.training.pack import read_pack
-    from improvo.training.pictures import Pictures
 
     folder: Path = arguments.work / job["name"]
     pictures, posed, data = read_pack(arguments.pack)

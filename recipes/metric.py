@@ -13,9 +13,9 @@ from pathlib import Path
 import cv2
 
 from improvo.frontend.weights import find_weights
-from improvo.training.descriptor_metric import MetricSettings
+from improvo.training.data.pack import read_pack
 from improvo.training.metric_training import train_metric
-from improvo.training.pack import read_pack
+from improvo.training.stages.descriptor_metric import MetricSettings
 
 
 def main() -> None:

@@ -24,7 +24,7 @@ from improvo.cli.train_options import read_data_card
 from improvo.errors import ImprovoError
 from improvo.training.distributed import Process
 from improvo.training.settings import HomographiesSettings
-from improvo.training.stages import train_homographies
+from improvo.training.superpoint_training import train_homographies
 
 HERE = Path(__file__).parent
 

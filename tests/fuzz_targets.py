@@ -172,7 +172,7 @@ def _archive_targets() -> dict[str, Target]:
     from improvo.frontend.importing import read_public_file
     from improvo.frontend.weights import load_weights, save_weights
     from improvo.geometry.camera_files import load_calibration
-    from improvo.training.labels import PointLabels, load_labels, save_labels
+    from improvo.training.data.point_labels import PointLabels, load_labels, save_labels
     from improvo.types import Features
     from network_examples import random_weights
 
@@ -271,10 +271,10 @@ def _training_targets() -> dict[str, Target]:
         from training_examples import tiny_trainer
     except ImportError:
         return {}
+    from improvo.training.data.pack import read_pack, write_pack
+    from improvo.training.data.pictures import Pictures, Source
+    from improvo.training.data.posed_sequence import PosedSequence
     from improvo.training.metrics import METRICS, keep_metrics
-    from improvo.training.pack import read_pack, write_pack
-    from improvo.training.pictures import Pictures, Source
-    from improvo.training.posed import PosedSequence
     from improvo.training.trainer import Trainer
 
     def checkpoint(folder: Path) -> Path:

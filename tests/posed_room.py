@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from improvo.training.posed import PosedSequence, block_inverse_depth
+from improvo.training.data.posed_sequence import PosedSequence, block_inverse_depth
 from improvo.types import Float64, UInt8
 
 K = np.array([[150.0, 0.0, 79.5], [0.0, 150.0, 59.5], [0.0, 0.0, 1.0]])

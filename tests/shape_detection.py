@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from improvo.evaluation.statistics import average_precision
-from improvo.training.photometric import augment
+from improvo.training.augmentation.photometric import augment
+from improvo.training.data.shapes import FAMILIES, draw_shape
 from improvo.training.settings import PhotometricSettings
-from improvo.training.shapes import FAMILIES, draw_shape
 from improvo.types import Float32, UInt8
 
 # grey image -> keypoints (N, 2) and their scores (N,)

@@ -20,7 +20,7 @@ from improvo.evaluation.homography.protocol import (
 )
 from improvo.evaluation.settings import HomographySettings
 from improvo.evaluation.sources import LoadedFrontend
-from improvo.training.views import inside, warp_points
+from improvo.training.augmentation.views import inside, warp_points
 from improvo.types import Features, Float64
 
 SETTINGS = HomographySettings()

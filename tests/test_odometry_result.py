@@ -12,7 +12,7 @@ from improvo.geometry import se3
 from improvo.geometry.alignment import Similarity
 from improvo.odometry.events import EventLog
 from improvo.odometry.map_builder import MapBuilder
-from improvo.odometry.mapping.window import WindowReport
+from improvo.odometry.mapping.bundle_adjustment import WindowReport
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.segments import Segment, SegmentPlacement
 from improvo.odometry.trajectory_builder import TrajectoryBuilder

@@ -129,9 +129,9 @@ def test_the_order_of_rows_changes_nothing_of_a_run(
 
 def test_the_order_of_rows_changes_nothing_that_is_trained_on(tmp_path: Path) -> None:
     from improvo.labeling.labeled import read_labels
-    from improvo.training.labeled_frames import LabeledFrames
+    from improvo.training.data.labeled_frames import LabeledFrames
+    from improvo.training.data.wrong_links import largest_step_shares
     from improvo.training.settings import LandmarkSettings
-    from improvo.training.wrong_links import largest_step_shares
 
     stores = [write_labeled_scene(tmp_path / name, wrong_link=True) for name in ("as-written", "reversed")]
     reverse_tracks(stores[1] / "walls")

@@ -14,11 +14,11 @@ from posed_room import posed_room  # noqa: E402
 
 from improvo.errors import ConfigError  # noqa: E402
 from improvo.geometry import se3  # noqa: E402
-from improvo.training.alignment import Aligned, aligned  # noqa: E402
+from improvo.training.batches.alignment import Aligned, aligned  # noqa: E402
+from improvo.training.batches.picture_store import PictureStore  # noqa: E402
+from improvo.training.batches.posed_frames import PosedFrames  # noqa: E402
+from improvo.training.data.posed_sequence import PosedSequence  # noqa: E402
 from improvo.training.held_settings import AlignmentSettings  # noqa: E402
-from improvo.training.picture_store import PictureStore  # noqa: E402
-from improvo.training.posed import PosedSequence  # noqa: E402
-from improvo.training.posed_frames import PosedFrames  # noqa: E402
 
 CPU = torch.device("cpu")
 ROWS = np.array([[0, 3], [2, 1]])

@@ -10,8 +10,18 @@ import numpy as np
 import pytest
 
 from improvo.errors import InputError
-from improvo.training.labels import DUSTBIN, IGNORED, Consensus, PointLabels, label_cells, load_labels, save_labels
-from improvo.training.pictures import Pictures, Source, load_pictures
+from improvo.training.augmentation.views import inside, random_view, warp_points
+from improvo.training.data.pictures import Pictures, Source, load_pictures
+from improvo.training.data.point_labels import (
+    DUSTBIN,
+    IGNORED,
+    Consensus,
+    PointLabels,
+    label_cells,
+    load_labels,
+    save_labels,
+)
+from improvo.training.data.shapes import FAMILIES, draw_shape
 from improvo.training.settings import (
     AdaptationSettings,
     HomographiesSettings,
@@ -19,8 +29,6 @@ from improvo.training.settings import (
     PhotometricSettings,
     ViewSettings,
 )
-from improvo.training.shapes import FAMILIES, draw_shape
-from improvo.training.views import inside, random_view, warp_points
 
 NO_LIGHT_CHANGE = PhotometricSettings(0.0, (1.0, 1.0), (1.0, 1.0), 0, 0, 0, 0, 0, 0, 0, 0.0, 0.0, 0)
 
@@ -119,7 +127,7 @@ def test_labels_survive_their_file(tmp_path: Path) -> None:
 
 
 def test_points_of_a_pair_show_the_same_place() -> None:
-    from improvo.training.pairs import PairBatches
+    from improvo.training.batches.homography_pairs import PairBatches
 
     rng = np.random.default_rng(0)
     smooth = cv2.GaussianBlur(rng.uniform(0, 255, (240, 320)).astype(np.float32), (0, 0), 6)
@@ -174,7 +182,7 @@ def test_folders_without_a_picture_are_refused(tmp_path: Path) -> None:
 
 
 def test_augmentation_is_seeded_and_stays_in_range() -> None:
-    from improvo.training.photometric import augment
+    from improvo.training.augmentation.photometric import augment
 
     image = np.tile(np.arange(160, dtype=np.uint8), (120, 1))
     for seed in range(20):

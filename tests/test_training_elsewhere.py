@@ -18,11 +18,11 @@ from improvo.frontend.runtime_torch import load_network  # noqa: E402
 from improvo.frontend.settings import NetworkSettings  # noqa: E402
 from improvo.frontend.weights import Weights, find_weights, load_weights  # noqa: E402
 from improvo.improvement.settings import ImproveSettings  # noqa: E402
-from improvo.training.elsewhere import BUNDLED_SOURCE, HeldElsewhere, bundled_pictures  # noqa: E402
-from improvo.training.held import HeldStage  # noqa: E402
+from improvo.training.batches.elsewhere import BUNDLED_SOURCE, HeldElsewhere, bundled_pictures  # noqa: E402
+from improvo.training.data.pictures import Pictures  # noqa: E402
 from improvo.training.held_settings import ElsewhereSettings, HeldSettings  # noqa: E402
 from improvo.training.held_training import train_held  # noqa: E402
-from improvo.training.pictures import Pictures  # noqa: E402
+from improvo.training.stages.held import HeldStage  # noqa: E402
 from test_training_held import SMALL, photographs  # noqa: E402
 from training_examples import stopped_after  # noqa: E402
 

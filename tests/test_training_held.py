@@ -20,24 +20,24 @@ from improvo.errors import ConfigError, InputError  # noqa: E402
 from improvo.frontend.architecture import ARCHITECTURES  # noqa: E402
 from improvo.frontend.superpoint import SuperPoint  # noqa: E402
 from improvo.frontend.weights import DataSource, find_weights, load_weights  # noqa: E402
-from improvo.training.device_pairs import DevicePairs  # noqa: E402
-from improvo.training.held import HeldStage  # noqa: E402
+from improvo.training.augmentation.photometric_batch import augment_batch  # noqa: E402
+from improvo.training.augmentation.views import inside, warp_image, warp_points  # noqa: E402
+from improvo.training.augmentation.views_batch import random_views  # noqa: E402
+from improvo.training.batches.device_pairs import DevicePairs  # noqa: E402
+from improvo.training.batches.mixed_pairs import MixedPairs  # noqa: E402
+from improvo.training.batches.pair_points import PairPlan, PairPoints  # noqa: E402
+from improvo.training.batches.picture_store import DepthStore, PictureStore  # noqa: E402
+from improvo.training.batches.posed_frames import PosedFrames  # noqa: E402
+from improvo.training.data.pack import read_pack, write_pack  # noqa: E402
+from improvo.training.data.pictures import Pictures, Source  # noqa: E402
+from improvo.training.data.posed_sequence import overlapping_pairs  # noqa: E402
 from improvo.training.held_settings import DevicePairSettings, HeldSettings  # noqa: E402
 from improvo.training.held_training import train_held  # noqa: E402
-from improvo.training.losses import held_loss, info_nce_loss  # noqa: E402
-from improvo.training.mixed_pairs import MixedPairs  # noqa: E402
-from improvo.training.pack import read_pack, write_pack  # noqa: E402
-from improvo.training.pair_points import PairPlan, PairPoints  # noqa: E402
-from improvo.training.photometric_batch import augment_batch  # noqa: E402
-from improvo.training.picture_store import DepthStore, PictureStore  # noqa: E402
-from improvo.training.pictures import Pictures, Source  # noqa: E402
-from improvo.training.posed import overlapping_pairs  # noqa: E402
-from improvo.training.posed_frames import PosedFrames  # noqa: E402
-from improvo.training.random_views import random_views  # noqa: E402
 from improvo.training.settings import OptimiserSettings, PhotometricSettings, ViewSettings  # noqa: E402
-from improvo.training.stage import Stage  # noqa: E402
+from improvo.training.stages.base import Stage  # noqa: E402
+from improvo.training.stages.held import HeldStage  # noqa: E402
+from improvo.training.stages.losses import held_loss, info_nce_loss  # noqa: E402
 from improvo.training.trainer import Trainer  # noqa: E402
-from improvo.training.views import inside, warp_image, warp_points  # noqa: E402
 from training_examples import stopped_after  # noqa: E402
 
 CPU = torch.device("cpu")

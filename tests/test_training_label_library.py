@@ -13,9 +13,10 @@ pytest.importorskip("torch", reason="training needs the extra `train`")
 
 from improvo.errors import InputError
 from improvo.labeling.labeled import LabeledSequence, read_labels
-from improvo.training import landmark_files
-from improvo.training.label_library import SPARE, LabelLibrary
-from improvo.training.labeled_frames import LabeledFrames
+from improvo.training.batches.tracked_pairs import TrackedPairs
+from improvo.training.data import landmark_files
+from improvo.training.data.label_library import SPARE, LabelLibrary
+from improvo.training.data.labeled_frames import LabeledFrames
 from improvo.training.settings import (
     LandmarkSettings,
     OdometryTrainingSettings,
@@ -23,7 +24,6 @@ from improvo.training.settings import (
     PairSettings,
     ViewSettings,
 )
-from improvo.training.tracked_pairs import TrackedPairs
 from labeled_scene import write_labeled_scene
 
 SETTINGS = OdometryTrainingSettings(
@@ -80,7 +80,7 @@ def test_batches_are_those_of_a_training_that_holds_everything_in_memory(
 def test_files_are_made_once_and_by_whom_does_not_matter(
     sequences: list[LabeledSequence], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("improvo.training.label_library._ENOUGH_FOR_PROCESSES", 1)
+    monkeypatch.setattr("improvo.training.data.label_library._ENOUGH_FOR_PROCESSES", 1)
     library(sequences, tmp_path / "out", workers=2)
     made = [files_of(sequence)[0].read_bytes() for sequence in sequences]
     monkeypatch.setattr(landmark_files, "find_landmarks", None)  # would fail

@@ -14,7 +14,7 @@ from improvo.frontend.network import NetworkFrontend
 from improvo.frontend.settings import NetworkSettings
 from improvo.frontend.weights import find_weights, load_weights
 from improvo.tracking.matching import mutual_nearest_neighbours
-from improvo.training.descriptor_metric import MetricSettings, Scatter, found_again, with_descriptor_map
+from improvo.training.stages.descriptor_metric import MetricSettings, Scatter, found_again, with_descriptor_map
 from improvo.types import Features
 
 pytest.importorskip("torch")

@@ -19,9 +19,9 @@ from improvo.frontend.superpoint import SuperPoint, sample_stability  # noqa: E4
 from improvo.frontend.weights import ModelCard, load_weights, save_weights  # noqa: E402
 from improvo.labeling.labeled import read_labels  # noqa: E402
 from improvo.stability.rule import IGNORE, STABLE, UNSTABLE  # noqa: E402
-from improvo.training.labeled_frames import LabeledFrames, common_points  # noqa: E402
-from improvo.training.labels import IGNORED  # noqa: E402
-from improvo.training.losses import info_nce_loss, stability_loss  # noqa: E402
+from improvo.training.batches.tracked_pairs import TrackedPairs  # noqa: E402
+from improvo.training.data.labeled_frames import LabeledFrames, common_points  # noqa: E402
+from improvo.training.data.point_labels import IGNORED  # noqa: E402
 from improvo.training.settings import (  # noqa: E402
     LandmarkSettings,
     OdometryTrainingSettings,
@@ -29,7 +29,7 @@ from improvo.training.settings import (  # noqa: E402
     PairSettings,
     ViewSettings,
 )
-from improvo.training.tracked_pairs import TrackedPairs  # noqa: E402
+from improvo.training.stages.losses import info_nce_loss, stability_loss  # noqa: E402
 from labeled_scene import (  # noqa: E402
     CAMERA,
     FAR,
@@ -294,9 +294,9 @@ def test_pictures_are_replayed_beside_the_labels(store: Path, tiny_weights: Path
     card = load_weights(tmp_path / "out" / "weights.safetensors").card
     assert [source.name for source in card.data] == ["walls", "pictures"]
 
-    from improvo.training.labels import load_labels
-    from improvo.training.pairs import PairBatches
-    from improvo.training.pictures import load_pictures
+    from improvo.training.batches.homography_pairs import PairBatches
+    from improvo.training.data.pictures import load_pictures
+    from improvo.training.data.point_labels import load_labels
     from improvo.training.settings import HomographiesSettings
 
     settings = settings_of()

@@ -21,11 +21,12 @@ from improvo.frontend.weights import ModelCard, load_weights, save_weights  # no
 from improvo.labeling.labeled import read_labels  # noqa: E402
 from improvo.presets import preset  # noqa: E402
 from improvo.stability.rule import STABLE, UNSTABLE  # noqa: E402
-from improvo.training.labeled_frames import FramePoints, LabeledFrames  # noqa: E402
-from improvo.training.labels import DUSTBIN, IGNORED, PointLabels  # noqa: E402
-from improvo.training.landmarks import Summary  # noqa: E402
-from improvo.training.pairs import PairBatches  # noqa: E402
-from improvo.training.pictures import Pictures, Source  # noqa: E402
+from improvo.training.batches.homography_pairs import PairBatches  # noqa: E402
+from improvo.training.batches.tracked_pairs import TrackedPairs  # noqa: E402
+from improvo.training.data.labeled_frames import FramePoints, LabeledFrames  # noqa: E402
+from improvo.training.data.landmarks import Summary  # noqa: E402
+from improvo.training.data.pictures import Pictures, Source  # noqa: E402
+from improvo.training.data.point_labels import DUSTBIN, IGNORED, PointLabels  # noqa: E402
 from improvo.training.settings import (  # noqa: E402
     HomographiesSettings,
     OdometryTrainingSettings,
@@ -34,9 +35,8 @@ from improvo.training.settings import (  # noqa: E402
     ShapesSettings,
     ViewSettings,
 )
-from improvo.training.superpoint_stages import JointStage  # noqa: E402
-from improvo.training.tracked_pairs import TrackedPairs  # noqa: E402
-from improvo.training.vo_adaptation import VOAdaptationStage  # noqa: E402
+from improvo.training.stages.superpoint import JointStage  # noqa: E402
+from improvo.training.stages.vo_adaptation import VOAdaptationStage  # noqa: E402
 from labeled_scene import write_labeled_scene  # noqa: E402
 
 TINY = Architecture("tiny", encoder=(4, 4, 4, 4, 8, 8, 8, 8), head=8, descriptor=8)

@@ -26,9 +26,9 @@ from improvo.frontend.runtime_torch import load_network
 from improvo.frontend.settings import NetworkOptions
 from improvo.frontend.weights import DataSource, find_weights, load_weights
 from improvo.simulation.causes import Cause
+from improvo.training.data.pack import write_pack
+from improvo.training.data.pictures import Pictures, Source
 from improvo.training.held_settings import HeldSettings
-from improvo.training.pack import write_pack
-from improvo.training.pictures import Pictures, Source
 from improvo.training.settings import OdometryTrainingSettings
 
 RECIPES = Path(__file__).parents[1] / "recipes"

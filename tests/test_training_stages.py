@@ -17,11 +17,11 @@ from improvo.cli.main import main  # noqa: E402
 from improvo.frontend.architecture import ARCHITECTURES, Architecture  # noqa: E402
 from improvo.frontend.superpoint import SuperPoint  # noqa: E402
 from improvo.frontend.weights import load_weights  # noqa: E402
-from improvo.training.losses import detector_loss, hinge_loss, info_nce_loss  # noqa: E402
-from improvo.training.pairs import PairBatches  # noqa: E402
+from improvo.training.batches.drawn_shapes import ShapeBatches, shape_source  # noqa: E402
+from improvo.training.batches.homography_pairs import PairBatches  # noqa: E402
 from improvo.training.settings import HomographiesSettings, OptimiserSettings, ShapesSettings, ViewSettings  # noqa: E402
-from improvo.training.superpoint_stages import JointStage, MagicPointStage  # noqa: E402
-from improvo.training.synthetic import ShapeBatches, shape_source  # noqa: E402
+from improvo.training.stages.losses import detector_loss, hinge_loss, info_nce_loss  # noqa: E402
+from improvo.training.stages.superpoint import JointStage, MagicPointStage  # noqa: E402
 from improvo.training.trainer import DivergedError, Trainer  # noqa: E402
 from improvo.training.widen import widen  # noqa: E402
 
@@ -35,7 +35,7 @@ def optimiser(**changes: Any) -> OptimiserSettings:
 
 
 def joint(folder: Path, **changes: Any) -> Trainer:
-    from improvo.training.pictures import Pictures
+    from improvo.training.data.pictures import Pictures
 
     folder.mkdir(exist_ok=True)
     source, labels = shape_source(9, 1, 1.0)
@@ -200,8 +200,8 @@ def test_a_widened_network_computes_the_same() -> None:
 
 
 def test_views_made_in_a_batch_are_those_made_one_by_one() -> None:
-    from improvo.training.adaptation import warp_batch
-    from improvo.training.views import random_view, warp_image
+    from improvo.training.augmentation.views import random_view, warp_image
+    from improvo.training.data.homographic_adaptation import warp_batch
 
     rng = np.random.default_rng(0)
     picture = cv2.GaussianBlur(rng.uniform(0, 255, (96, 128)).astype(np.float32), (0, 0), 3)
@@ -213,8 +213,8 @@ def test_views_made_in_a_batch_are_those_made_one_by_one() -> None:
 
 
 def test_adaptation_finds_the_corners_of_a_board() -> None:
-    from improvo.training.adaptation import adapt, shi_tomasi
-    from improvo.training.pictures import Pictures, Source
+    from improvo.training.data.homographic_adaptation import adapt, shi_tomasi
+    from improvo.training.data.pictures import Pictures, Source
     from improvo.training.settings import AdaptationSettings
 
     y, x = np.mgrid[0:240, 0:320]
@@ -286,7 +286,7 @@ def test_a_finished_folder_is_left_as_it_is_and_other_settings_are_refused(
     assert (tmp_path / "shapes" / "weights.safetensors").read_bytes() == weights
     capsys.readouterr()
     assert main([*command, "--seed", "4"]) == 2
-    assert "optimiser.seed" in capsys.readouterr().err
+    assert "was begun with --seed 0, now with --seed 4" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

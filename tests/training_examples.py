@@ -12,9 +12,9 @@ import torch
 
 from improvo.frontend.architecture import Architecture
 from improvo.frontend.superpoint import SuperPoint
+from improvo.training.batches.drawn_shapes import ShapeBatches
 from improvo.training.settings import OptimiserSettings, ShapesSettings, ViewSettings
-from improvo.training.superpoint_stages import MagicPointStage
-from improvo.training.synthetic import ShapeBatches
+from improvo.training.stages.superpoint import MagicPointStage
 from improvo.training.trainer import Trainer
 
 TINY = Architecture("tiny", encoder=(4, 4, 4, 4, 8, 8, 8, 8), head=8, descriptor=8, stability=False)

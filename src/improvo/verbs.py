@@ -190,10 +190,10 @@ def train_odometry(
     from improvo.training.settings import OdometryTrainingSettings
 
     need_torch()
-    from improvo.training import stages
+    from improvo.training.odometry_training import train_odometry
 
     settings, folder = settings or OdometryTrainingSettings(), local_folder(output)
-    metrics = stages.train_odometry(
+    metrics = train_odometry(
         [local_folder(path, writing=False) for path in _each(labels)],
         settings,
         folder,

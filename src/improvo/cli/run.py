@@ -23,7 +23,6 @@ from improvo.cli.options import (
 )
 from improvo.cli.output import figures, next_step, notice, say, typed
 from improvo.depth.run_settings import DenseRunSettings
-from improvo.errors import InputError
 from improvo.odometry.scale.settings import USAGE, scale_settings
 from improvo.terminal import counted
 
@@ -109,7 +108,9 @@ def _tracked(arguments: argparse.Namespace, sequence: Sequence, settings: DenseR
     viewer = _viewer(arguments)
     summary = _track(sequence, arguments.output, settings, viewer)
     if ask is not None:
-        summary = _in_metres(sequence, summary, ask, settings)
+        from improvo.odometry.scale.apply import apply_scale
+
+        summary = apply_scale(sequence, summary, ask, settings.scale)
     figures(_figures(summary), "")
     _print_summary(summary)
     interrupted = bool(summary.report["interrupted"])
@@ -152,16 +153,6 @@ def _scale_source(sequence: Sequence, settings: DenseRunSettings) -> Ask | None:
 
     with progress("markers", "frame", shown=settings.scale.source == "marker") as shown:
         return scale_source(sequence, settings.scale, shown.advance)
-
-
-def _in_metres(sequence: Sequence, summary: LabeledRun, ask: Ask, settings: DenseRunSettings) -> LabeledRun:
-    """The run in metres; an error says that the results are there all the same."""
-    from improvo.odometry.scale.apply import apply_scale
-
-    try:
-        return apply_scale(sequence, summary, ask, settings.scale)
-    except InputError as error:
-        raise InputError(f"{error}; {summary.folder} holds the run, up to scale") from None
 
 
 def _track(sequence: Sequence, folder: Path, settings: DenseRunSettings, viewer: RerunViewer | None) -> LabeledRun:

@@ -34,7 +34,7 @@ def run_shapes(arguments: argparse.Namespace) -> None:
     settings = settings_from(ShapesSettings, arguments)
     check_output_folder(arguments.output, "train shapes")
     need_torch()
-    from improvo.training.stages import train_shapes
+    from improvo.training.superpoint_training import train_shapes
 
     metrics = train_shapes(settings, arguments.output, starting_weights(arguments.parent))
     weights = arguments.output / "weights.safetensors"
@@ -70,7 +70,7 @@ def run_homographies(arguments: argparse.Namespace) -> None:
     check_output_folder(arguments.output, "train homographies")
     data = read_data_card(arguments.data_card)
     need_torch()
-    from improvo.training.stages import train_homographies
+    from improvo.training.superpoint_training import train_homographies
 
     metrics = train_homographies(
         arguments.sources,
@@ -114,7 +114,7 @@ def run_odometry(arguments: argparse.Namespace) -> None:
     data = read_data_card(arguments.data_card)
     need_torch()
     from improvo.frontend.weights import find_weights
-    from improvo.training.stages import train_odometry
+    from improvo.training.odometry_training import train_odometry
 
     start = find_weights(arguments.parent)
     metrics = train_odometry(arguments.labels, settings, arguments.output, start, data, pictures=arguments.pictures)

@@ -15,7 +15,7 @@ from improvo.untrusted.text import load_json, reason
 
 if TYPE_CHECKING:
     from improvo.frontend.weights import DataSource
-    from improvo.training.pictures import Pictures
+    from improvo.training.data.pictures import Pictures
 
 
 def add_training_arguments(parser: argparse.ArgumentParser, defaults: Any, parent: str | None = None) -> None:

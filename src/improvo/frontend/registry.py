@@ -7,7 +7,7 @@ from pathlib import Path
 
 from improvo.errors import ConfigError
 from improvo.frontend import Frontend
-from improvo.frontend.settings import DEFAULT_FRONTEND, FrontendSettings, NetworkOptions, NetworkSettings
+from improvo.frontend.settings import DEFAULT_FRONTEND, FrontendSettings, NetworkOptions
 
 CLASSICAL = ("sift", "orb", "akaze", "surf")
 NETWORKS = ("superpoint-vo", "superpoint", "superpoint-vo-small", "superpoint-small")
@@ -53,11 +53,9 @@ def load_frontend(
         spread = name == "orb" and not opencv_defaults
         frontend = ClassicalFrontend(name, max_keypoints, sensitive=not opencv_defaults, spread=spread)
     else:
-        from improvo.frontend.network import NetworkFrontend
-        from improvo.frontend.weights import find_weights, load_weights
+        from improvo.frontend.network import load_network_frontend
 
-        settings = NetworkSettings(max_keypoints=max_keypoints, **asdict(network or NetworkOptions()))
-        frontend = NetworkFrontend(load_weights(find_weights(name)), settings, name=name)
+        frontend = load_network_frontend(name, max_keypoints=max_keypoints, **asdict(network or NetworkOptions()))
     if not least_stability:
         return frontend
     from improvo.frontend.stable_only import StableOnly, no_stability_head

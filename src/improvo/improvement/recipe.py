@@ -16,7 +16,7 @@ from improvo.labeling.store import DONE, read_records
 
 if TYPE_CHECKING:
     from improvo.frontend.weights import DataSource
-    from improvo.training.posed import PosedSequence
+    from improvo.training.data.posed_sequence import PosedSequence
 
 _FEWEST = 300  # steps, however short the training part is
 _PART_WAY = "part-way"  # the stage that goes back towards the start
@@ -96,8 +96,8 @@ def steps_of(settings: ImproveSettings, frames: int) -> int:
 
 
 def _train_held(job: TrainingJob) -> dict[str, Any]:
+    from improvo.training.data.pictures import Pictures, Source
     from improvo.training.held_training import train_held
-    from improvo.training.pictures import Pictures, Source
 
     settings = job.settings.held
     posed = _teaching(job, settings.longer_side)
@@ -121,8 +121,8 @@ def _train_held(job: TrainingJob) -> dict[str, Any]:
 
 
 def _train_metric(job: TrainingJob) -> dict[str, Any]:
-    from improvo.training.descriptor_metric import NoDescriptorMapError
     from improvo.training.metric_training import train_metric
+    from improvo.training.stages.descriptor_metric import NoDescriptorMapError
 
     settings = job.settings.metric
     settings = replace(settings, seed=job.seed, two_frames=settings.two_frames and not job.control)
@@ -167,7 +167,7 @@ def _source(posed: PosedSequence, kind: Any) -> Any:
 
 
 def _train_tracks(job: TrainingJob) -> dict[str, Any]:
-    from improvo.training.stages import train_odometry
+    from improvo.training.odometry_training import train_odometry
 
     settings = job.settings.training
     steps = job.steps or settings.optimiser.steps

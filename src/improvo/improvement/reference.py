@@ -27,7 +27,7 @@ from improvo.improvement.split import Part
 from improvo.labeling.labeled import LabeledSequence, read_labels
 from improvo.sequences import open_sequence
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE
-from improvo.training.posed import PosedSequence
+from improvo.training.data.posed_sequence import PosedSequence
 from improvo.types import Features, Float32, Float64, Int64, Mask, UInt8
 
 TRAINING, HELD_BACK = "training", "held-back"

@@ -12,9 +12,9 @@ from improvo.odometry.run_settings import RunSettings
 from improvo.odometry.settings import OdometrySettings
 from improvo.sequences.base import SequenceSettings
 from improvo.stability.settings import LabelSettings
-from improvo.training.descriptor_metric import MetricSettings
 from improvo.training.held_settings import DevicePairSettings, ElsewhereSettings, HeldSettings
 from improvo.training.settings import OdometryTrainingSettings, OptimiserSettings
+from improvo.training.stages.descriptor_metric import MetricSettings
 
 DEFAULT_START = "superpoint-small"  # on a CPU a step takes a quarter of the time of one of `superpoint`
 HELD, METRIC, TRACKS = "held", "metric", "tracks"

@@ -8,7 +8,7 @@
             frames.parquet      frame, index in the recording, time, segment, trusted
             images-00000.parquet ...   with --pack: the frames themselves
             label.json          this sequence's row of the manifest
-            landmarks-*.safetensors   made by training from the tables, see `improvo.training.landmark_files`
+            landmarks-*.safetensors   made by training from the tables, see `improvo.training.data.landmark_files`
 
 A sequence in work lives in `.NAME.partial`, and whoever works on it holds `.NAME.lock`, so that several commands can
 fill one store. What a killed run leaves there is cleared away by the next one. The manifest is made from the folders,

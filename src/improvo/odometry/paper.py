@@ -16,8 +16,8 @@ from improvo.odometry.alarms.two_view_check import TwoViewCheck
 from improvo.odometry.events import EventLog
 from improvo.odometry.gates import FEWEST
 from improvo.odometry.mapper import Mapper
+from improvo.odometry.mapping.bundle_adjustment import adjust
 from improvo.odometry.mapping.local_map import LocalMap
-from improvo.odometry.mapping.window import adjust
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import TrackingState

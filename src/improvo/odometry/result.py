@@ -11,7 +11,7 @@ from improvo.geometry import se3
 from improvo.geometry.alignment import Similarity
 from improvo.geometry.camera import Camera
 from improvo.odometry.map_builder import MapBuilder
-from improvo.odometry.mapping.window import WindowReport
+from improvo.odometry.mapping.bundle_adjustment import WindowReport
 from improvo.odometry.segments import Segment, SegmentPlacement, extended
 from improvo.odometry.trajectory_builder import TrajectoryBuilder
 from improvo.odometry.verdict.verdict import NOT_JUDGED, Verdict

@@ -11,12 +11,12 @@ from improvo.odometry.events import EventLog
 from improvo.odometry.gates import MEMORY_FRAMES, gate
 from improvo.odometry.mapper import Mapper
 from improvo.odometry.mapping.bridging import Bridging
+from improvo.odometry.mapping.bundle_adjustment import OBJECTIVE, SOLVER, WindowReport, adjust
 from improvo.odometry.mapping.former_map import FormerMap
 from improvo.odometry.mapping.initial_pair import InitFailure
 from improvo.odometry.mapping.local_map import LocalMap
 from improvo.odometry.mapping.sliding_window import SlidingWindow
 from improvo.odometry.mapping.start import start_map
-from improvo.odometry.mapping.window import OBJECTIVE, SOLVER, WindowReport, adjust
 from improvo.odometry.result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.states import StateMachine, TrackingState

@@ -14,16 +14,17 @@ from improvo.errors import InputError
 from improvo.frontend.channel_pruning import without_dead_channels
 from improvo.frontend.superpoint import SuperPoint
 from improvo.frontend.weights import DataSource, Weights, load_weights
-from improvo.training.device_pairs import DevicePairs
-from improvo.training.elsewhere import BUNDLED_SOURCE, HeldElsewhere, bundled_pictures
-from improvo.training.held import HeldStage
+from improvo.training.batches.device_pairs import DevicePairs
+from improvo.training.batches.elsewhere import BUNDLED_SOURCE, HeldElsewhere, bundled_pictures
+from improvo.training.batches.teacher import network_teacher
+from improvo.training.data.pictures import Pictures
+from improvo.training.data.posed_sequence import PosedSequence
+from improvo.training.device import choose_device, choose_precision
 from improvo.training.held_settings import HeldSettings
 from improvo.training.networks import started_network
-from improvo.training.pictures import Pictures
-from improvo.training.posed import PosedSequence
-from improvo.training.stage_folder import model_card, not_stated, run_stage
-from improvo.training.teacher import network_teacher
-from improvo.training.trainer import Batches, choose_device, choose_precision
+from improvo.training.output_folder import model_card, not_stated, run_stage
+from improvo.training.stages.held import HeldStage
+from improvo.training.trainer import Batches
 
 
 def train_held(
@@ -83,9 +84,9 @@ def train_held(
 
 def _with_tracks(dense: DevicePairs, labels: Sequence[Path], output: Path) -> Batches:
     from improvo.labeling.labeled import read_labels
-    from improvo.training.label_library import LabelLibrary
-    from improvo.training.mixed_pairs import MixedPairs, tracked_settings
-    from improvo.training.tracked_pairs import TrackedPairs
+    from improvo.training.batches.mixed_pairs import MixedPairs, tracked_settings
+    from improvo.training.batches.tracked_pairs import TrackedPairs
+    from improvo.training.data.label_library import LabelLibrary
 
     settings = tracked_settings(dense.settings)
     sequences = [sequence for folder in labels for sequence in read_labels(folder)]

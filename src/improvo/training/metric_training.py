@@ -17,15 +17,15 @@ from improvo.frontend.architecture import CELL
 from improvo.frontend.network import NetworkFrontend
 from improvo.frontend.settings import NetworkSettings
 from improvo.frontend.weights import DataSource, load_weights, save_weights
-from improvo.training.descriptor_metric import MetricSettings, Scatter, found_again, with_descriptor_map
+from improvo.training.augmentation.photometric import augment
+from improvo.training.augmentation.views import inside, random_view, warp_image, warp_points
+from improvo.training.batches.posed_frames import PosedFrames
+from improvo.training.data.posed_sequence import PosedSequence, overlapping_pairs
 from improvo.training.held_settings import DevicePairSettings
 from improvo.training.metrics import METRICS, append_metrics, read_metrics
-from improvo.training.photometric import augment
-from improvo.training.posed import PosedSequence, overlapping_pairs
-from improvo.training.posed_frames import PosedFrames
+from improvo.training.output_folder import SETTINGS, WEIGHTS, commit_of_code, learned_from, not_stated, stage_folder
 from improvo.training.settings import PhotometricSettings, ViewSettings
-from improvo.training.stage_folder import SETTINGS, WEIGHTS, commit_of_code, learned_from, not_stated, stage_folder
-from improvo.training.views import inside, random_view, warp_image, warp_points
+from improvo.training.stages.descriptor_metric import MetricSettings, Scatter, found_again, with_descriptor_map
 from improvo.types import Features, Float64, Int64, Mask, UInt8
 
 Pair = tuple[Features, Features, Int64]  # of two frames, and keypoints (K, 2) that show the same place

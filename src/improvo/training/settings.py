@@ -192,7 +192,7 @@ class LandmarkSettings:
     # it shows, so it is not taught as unstable; 0 is the paper
     unstable_median_error: float = 1.0
     # nor is an unstable track taught if one link makes more than this share of the way that its error goes
-    # (`improvo.training.wrong_links`); 1 is the paper
+    # (`improvo.training.data.wrong_links`); 1 is the paper
     unstable_largest_step: float = 0.25
     largest_correction: float = 2.0  # pixels of the recording between the two; beyond it the keypoint holds
     largest_view_angle_degrees: float = 40.0  # from the mean direction in which an unseen point was seen

@@ -23,13 +23,14 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from improvo import files, terminal
-from improvo.errors import ConfigError, ImprovoError, InputError
+from improvo.errors import ImprovoError, InputError
 from improvo.formats import FORMAT, FORMAT_KEY, check_format
+from improvo.training.device import choose_device, choose_precision
 from improvo.training.distributed import Process
 from improvo.training.metrics import METRICS, append_metrics, keep_metrics
 from improvo.training.settings import OptimiserSettings
 from improvo.training.shared_statistics import share_batch_norm
-from improvo.training.stage import Stage
+from improvo.training.stages.base import Stage
 
 CHECKPOINT = "checkpoint.pt"
 
@@ -44,27 +45,6 @@ class Batches(Protocol):
 
 class DivergedError(ImprovoError):
     """The loss is no longer a number."""
-
-
-def choose_device(name: str) -> torch.device:
-    """`auto` is CUDA where there is one.
-
-    Raises:
-        ConfigError: CUDA asked for where torch sees none.
-    """
-    if name.startswith("cuda") and not torch.cuda.is_available():
-        raise ConfigError(f"setting `optimiser.device`: torch sees no CUDA device for `{name}`; use cpu or auto")
-    return torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name)
-
-
-def choose_precision(name: str, device: torch.device) -> torch.dtype:
-    """`auto` is bfloat16 on processors that multiply it natively; elsewhere it would be emulated, and slow."""
-    if name == "auto":
-        capable = (
-            torch.cuda.is_bf16_supported() if device.type == "cuda" else torch.ops.mkldnn._is_mkldnn_bf16_supported()
-        )
-        return torch.bfloat16 if capable else torch.float32
-    return {"float32": torch.float32, "bfloat16": torch.bfloat16}[name]
 
 
 class Trainer:

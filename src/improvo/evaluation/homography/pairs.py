@@ -13,8 +13,8 @@ from improvo.evaluation.settings import HomographySettings
 from improvo.frontend.architecture import CELL
 from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.images import read_grey
+from improvo.training.augmentation.views import random_view, warp_image
 from improvo.training.settings import ViewSettings
-from improvo.training.views import random_view, warp_image
 from improvo.types import Float64, UInt8
 from improvo.untrusted.paths import check_is_file
 

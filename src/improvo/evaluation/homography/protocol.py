@@ -20,7 +20,7 @@ from improvo.evaluation.statistics import Bootstrap, average_precision
 from improvo.evaluation.tables import bold_best, columns_to_rows, decimals, markdown
 from improvo.jobs.pool import Workers
 from improvo.tracking.matching import mutual_nearest_neighbours, unit_descriptors
-from improvo.training.views import inside, warp_points
+from improvo.training.augmentation.views import inside, warp_points
 from improvo.types import Features, Float64, Int64
 
 

@@ -10,9 +10,9 @@ from improvo.backend.settings import SolverSettings
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.odometry.gates import gate
+from improvo.odometry.mapping.bundle_adjustment import OBJECTIVE, SOLVER, adjust
 from improvo.odometry.mapping.initial_pair import InitFailure, InitialPair, initial_pair
 from improvo.odometry.mapping.local_map import LocalMap
-from improvo.odometry.mapping.window import OBJECTIVE, SOLVER, adjust
 from improvo.odometry.settings import OdometrySettings, WindowSettings
 from improvo.odometry.view import View, common_tracks
 

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from improvo.errors import InputError
 from improvo.files import write_json
 from improvo.geometry.trajectory_files import write_trajectory
 from improvo.odometry.map_file import read_map, write_map
@@ -56,7 +57,10 @@ def apply_scale(sequence: Sequence, run: Run, ask: Ask, settings: ScaleSettings)
     """
     if not run.tracked:
         return run
-    estimates = ask(TrackedRun(sequence, run))
+    try:
+        estimates = ask(TrackedRun(sequence, run))
+    except InputError as error:
+        raise InputError(f"{error}; {run.folder} holds the run, up to scale") from None
     maps = segment_maps(run.trajectory, estimates)
     trajectory = scaled_trajectory(run.trajectory, maps)
     report = {**run.report, **_entry(estimates, len(maps), settings)}

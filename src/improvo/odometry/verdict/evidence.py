@@ -17,7 +17,7 @@ from improvo.backend.solver import solve
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.odometry.gates import SAME_SCALE
-from improvo.odometry.mapping.window import OBJECTIVE, SOLVER
+from improvo.odometry.mapping.bundle_adjustment import OBJECTIVE, SOLVER
 from improvo.odometry.verdict.evidence_window import EvidenceKeyframe, EvidenceWindow
 from improvo.odometry.verdict.lens_evidence import LensMeasure, measured_lens
 from improvo.odometry.verdict.path_error import error_percent, scale_leverage

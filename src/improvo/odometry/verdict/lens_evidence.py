@@ -13,7 +13,7 @@ import numpy as np
 from improvo.backend.settings import SolverSettings
 from improvo.backend.solver import solve
 from improvo.geometry.camera import Camera
-from improvo.odometry.mapping.window import OBJECTIVE
+from improvo.odometry.mapping.bundle_adjustment import OBJECTIVE
 from improvo.odometry.verdict.evidence_window import EvidenceWindow
 
 _STEP = 0.15  # of the logarithm of the focal length, to both sides
