@@ -29,9 +29,8 @@ class SplitSettings:
     # of the sequences, at least one; of a single sequence, its last part. Without it a fifth, and of a single one no
     # fewer than `least_frames`, or a third where that is less
     share: float | None = None
-    least_frames: int = (
-        60  # wide gaps are 20 to 90 frames; with fewer held back they have no pair, or ten of one second
-    )
+    # wide gaps are 20 to 90 frames; with fewer held back they have no pair, or ten of the same second
+    least_frames: int = 60
 
     def __post_init__(self) -> None:
         if self.share is not None and not 0 < self.share < 1:
