@@ -20,12 +20,11 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.odometry.gates import FEWEST
+from improvo.odometry.gates import FEWEST, LARGE_PART
 from improvo.odometry.verdict.evidence_window import EvidenceKeyframe
 from improvo.types import Float64, Mask
 
 _MARGIN = 0.03  # of the picture's width: nearer to its border, frontends find no keypoints
-_HALF = 0.5  # of the usual share: right segments have .51 and more, but for one in 112
 _FEW_GAPS = 6  # fewer tell nothing of what is usual
 _FAR_APART_DEG = 5.0  # usual parallax between keyframes: 1 to 3 in videos, 11 in photographs around a thing
 
@@ -100,7 +99,7 @@ def looked_again(gaps: list[SeenAgain], keyframes: Sequence[EvidenceKeyframe], x
 
 
 def leaps(gaps: Sequence[SeenAgain]) -> tuple[SeenAgain, ...]:
-    """Gaps across which less than half is seen again of what is usual in their segment, in temporal order.
+    """Gaps across which much less is seen again than is usual in their segment, in temporal order.
 
     Args:
         gaps: of a segment, those between all successive keyframes.
@@ -109,7 +108,7 @@ def leaps(gaps: Sequence[SeenAgain]) -> tuple[SeenAgain, ...]:
     if len(telling) < _FEW_GAPS or np.median([gap.parallax_deg for gap in telling]) > _FAR_APART_DEG:
         return ()
     usual = float(np.median([gap.share for gap in telling]))
-    return tuple(gap for gap in telling if gap.share < _HALF * usual)
+    return tuple(gap for gap in telling if gap.share < LARGE_PART * usual)
 
 
 def _inside(in_camera: Float64, camera: Camera) -> Mask:
