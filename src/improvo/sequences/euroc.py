@@ -144,7 +144,7 @@ def _body_from_chain(path: Path, camera: str) -> Float64:
 def _rigid(values: object, path: Path, name: str) -> Float64:
     try:
         matrix = np.array(values, np.float64).reshape(1, 4, 4)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.full((1, 4, 4), np.nan)
     pose = clean_poses(matrix)[0][0]
     if not np.isfinite(pose).all():

@@ -127,7 +127,7 @@ def number(value: Any, key: str) -> float:
         raise ValueError(f"`{key}` is no number but {value!r}"[:120])
     try:
         return float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         comma = isinstance(value, str) and re.fullmatch(r"\s*[+-]?\d+,\d+(e[+-]?\d+)?\s*", value, re.IGNORECASE)
         hint = "; write a decimal point, not a comma" if comma else ""
         raise ValueError(f"`{key}` is no number but {value!r}"[:120] + hint) from None
