@@ -68,3 +68,8 @@ def align_points(target: Float64, source: Float64, with_scale: bool) -> Similari
     rotation = u @ np.diag(signs) @ vt
     scale = float(singular_values @ signs) / variance if with_scale else 1.0
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
+
+
+def path_length(positions: Float64) -> float:
+    """From the first of positions (N, 3) along all to the last."""
+    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from improvo.improvement.settings import ValidationSettings
-from improvo.improvement.validation import Validation, found, gain, loose
+from improvo.improvement.validation import Gain, Validation, found, gain, loose
 
 
 def rule(settings: ValidationSettings, earlier: bool = False) -> str:
@@ -39,27 +39,26 @@ def why_not_better(candidate: Validation, best: Validation, start: Validation, s
         settings: what its odometry may lose.
     """
     judge = settings.matches
+    rivals = (start,) if best is start else (start, best)
+    gains = [[gain(candidate, before, name(judge), judge) for name in (found, loose)] for before in rivals]
     faults = []
-    over_best, over_start = (
-        [gain(candidate, before, name(judge), judge) for name in (loose, found)] for before in (best, start)
-    )
-    if not any(one.low > 0 for one in over_start):
+    if not any(one.low > 0 for one in gains[0]):
         faults.append("neither number nor share of right matches is larger than at the start by more than chance")
-    elif not sum(one.relative for one in over_best) > 0:
+    elif not sum(one.relative for one in gains[-1]) > 0:
         faults.append(f"number and share of right matches together are no larger than {_named(best, start)}")
-    for before in (start,) if best is start else (start, best):
-        faults += _losses(candidate, before, start, settings)
+    for before, (number, share) in zip(rivals, gains, strict=True):
+        faults += _losses(candidate, before, number, share, _named(before, start), settings)
     return "; ".join(faults)
 
 
 def _losses(
-    candidate: Validation, before: Validation, start: Validation, settings: ValidationSettings
+    candidate: Validation, before: Validation, number: Gain, share: Gain, than: str, settings: ValidationSettings
 ) -> Iterator[str]:
     """What it loses: right matches, frames, or what was known of a recording of an earlier run."""
-    judge, than = settings.matches, _named(before, start)
-    if gain(candidate, before, found(judge), judge).high < 0:
+    judge = settings.matches
+    if number.high < 0:
         yield f"fewer of its matches are right than {than}, by more than chance"
-    if gain(candidate, before, loose(judge), judge).high < 0:
+    if share.high < 0:
         yield f"a smaller share of its matches is right than {than}, by more than chance"
     if candidate.tracked < (1 - settings.frames_lost) * before.tracked:
         yield f"fewer frames are tracked than {than} ({before.tracked})"

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from improvo.errors import InputError
+from improvo.geometry.alignment import path_length
 from improvo.sequences.base import SequenceSettings
 from improvo.sequences.live import LiveStream
 from improvo.sequences.opening import open_recording
@@ -154,5 +155,4 @@ def _truth(sequence: Sequence, problems: list[Problem]) -> dict[str, Any] | None
                 "evaluation leaves them out",
             )
         )
-    path = float(np.linalg.norm(np.diff(truth.camera_centers[truth.valid], axis=0), axis=1).sum())
-    return {"poses": valid, "path_length": round(path, 4)}
+    return {"poses": valid, "path_length": round(path_length(truth.camera_centers[truth.valid]), 4)}

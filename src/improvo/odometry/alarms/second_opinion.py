@@ -15,7 +15,7 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.geometry import se3
-from improvo.geometry.alignment import align_points
+from improvo.geometry.alignment import align_points, path_length
 from improvo.geometry.camera import Camera
 from improvo.geometry.triangulation import triangulate_tracks
 from improvo.odometry.events import EventLog
@@ -185,7 +185,7 @@ def same_poses(former: Poses, anew: Poses, max_error: float) -> bool:
     if turned.max() > _SAME * SAME_TURN_DEG:
         return False
     centers, centers_anew = (se3.inverse(each)[:, :3, 3] for each in (a, b))
-    path = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
+    path = path_length(centers)
     try:
         aligned = align_points(centers, centers_anew, with_scale=True).apply(centers_anew)
     except InputError:  # all on one spot

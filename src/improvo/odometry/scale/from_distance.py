@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from improvo.errors import InputError
+from improvo.geometry.alignment import path_length
 from improvo.odometry.scale.estimate import ScaleEstimate
 from improvo.odometry.scale.settings import ScaleSettings
 from improvo.odometry.scale.tracked import TrackedRun
@@ -74,7 +75,7 @@ def _measured(run: TrackedRun, first: int, last: int, metres: float) -> tuple[in
         )
     between = run.frames(int(segment[0]))
     centres = run.trajectory.camera_centers[between[(between >= low) & (between <= high)]]
-    way = float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
+    way = path_length(centres)
     distance = float(np.linalg.norm(centres[-1] - centres[0]))
     if distance <= 0 or _DRIFT * way > _MOST_ERROR * distance:
         raise InputError(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from improvo.errors import InputError
-from improvo.geometry.alignment import align_points
+from improvo.geometry.alignment import align_points, path_length
 from improvo.types import Float64, Int64
 
 _ROUNDING = 1e-12  # of coordinates, as a share of their size; positions that differ by less are one
@@ -35,11 +35,6 @@ def error_percent(path: Float64, reference: Float64, length: float | None = None
     except InputError:  # all on one spot
         return float("inf")
     return float(100.0 * np.sqrt(((aligned - reference) ** 2).sum(axis=1).mean()) / max(length, 1e-300))
-
-
-def path_length(positions: Float64) -> float:
-    """From the first of positions (N, 3) along all to the last."""
-    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 
 def scale_leverage(path: Float64, places: Sequence[tuple[int, int]]) -> Float64:
