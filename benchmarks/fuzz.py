@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 import traceback
+import typing
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from copy import deepcopy
@@ -167,6 +168,7 @@ def turn(name: str, first: int, count: int, shared: Any, results: Connection, en
     target = targets()[name]
     remember_yaml()
     remember_ros_code()
+    remember_type_hints()
     read_tables_in_one_thread()
     with tempfile.TemporaryDirectory(prefix="improvo-fuzz-", dir=SCRATCH) as place:
         example = Example(target, Path(place) / "example")
@@ -212,18 +214,26 @@ def remember_ros_code() -> None:
     from rosbags.serde import cdr, ros1, utils
     from rosbags.typesys import msg
 
-    compiled = lru_cache(maxsize=4096)(lambda text: compile(text, "<message>", "exec"))
     parsed = lru_cache(maxsize=1024)(msg.get_types_from_msg)
 
-    def compile_lines(lines: list[str]) -> ModuleType:
+    @lru_cache(maxsize=4096)
+    def module_of(text: str) -> ModuleType:
         module = ModuleType("tmpmod")
-        exec(compiled("\n".join(lines)), module.__dict__)
+        exec(compile(text, "<message>", "exec"), module.__dict__)
         return module
+
+    def compile_lines(lines: list[str]) -> ModuleType:
+        return module_of("\n".join(lines))
 
     for user in (cdr, ros1, utils):
         user.compile_lines = compile_lines  # type: ignore[attr-defined]
     for user in [one for one in sys.modules.values() if getattr(one, "get_types_from_msg", None)]:
         user.get_types_from_msg = lambda text, name: deepcopy(parsed(text, name))  # type: ignore[attr-defined]
+
+
+def remember_type_hints() -> None:
+    """Work out the types of the fields of each settings class once."""
+    typing.get_type_hints = lru_cache(maxsize=1024)(typing.get_type_hints)
 
 
 def read_tables_in_one_thread() -> None:
