@@ -170,6 +170,7 @@ def turn(name: str, first: int, count: int, shared: Any, results: Connection, en
     remember_ros_code()
     remember_type_hints()
     read_tables_in_one_thread()
+    remember_tables()
     with tempfile.TemporaryDirectory(prefix="improvo-fuzz-", dir=SCRATCH) as place:
         example = Example(target, Path(place) / "example")
         before = time.process_time()  # making the example does not count
@@ -241,6 +242,24 @@ def read_tables_in_one_thread() -> None:
     from pyarrow.parquet import ParquetFile
 
     ParquetFile.read = partialmethod(ParquetFile.read, use_threads=False)  # type: ignore[method-assign]
+
+
+def remember_tables() -> None:
+    """Read a table once: of a whole label store, all but one are the same every time."""
+    from improvo.stability import table_reading
+
+    parse = table_reading.read_table
+
+    @lru_cache(maxsize=64)
+    def read(content: bytes, path: Path, schema: Any) -> Any:
+        return parse(path, schema)
+
+    def read_table(path: Path, schema: Any) -> Any:
+        return read(path.read_bytes(), path, schema) if path.is_file() else parse(path, schema)
+
+    for module in [one for name, one in sys.modules.items() if name.startswith(PACKAGE)]:
+        if getattr(module, "read_table", None) is parse:
+            module.read_table = read_table  # type: ignore[attr-defined]
 
 
 def processor_seconds(pid: int | None) -> float:

@@ -34,7 +34,7 @@ from improvo.sequences.images import natural_key, read_image
 from improvo.sequences.mask import size_of
 from improvo.sequences.opening import FORMATS
 from improvo.stability.tables import read_points
-from improvo.untrusted.text import load_json, load_yaml, read_json_file
+from improvo.untrusted.text import first_line, load_json, load_yaml, read_json_file
 from sequence_builders import CAMERA, images, write_images
 from sequence_encoders import write_r3d
 
@@ -248,3 +248,8 @@ def test_a_picture_too_narrow_for_a_field_of_view_is_named_as_that(tmp_path: Pat
     assert "pictures of 3x4000 are too narrow for a field of view of 60 degrees across their width" in message
     assert "millimetres" not in message
     assert open_sequence(tmp_path, camera="500,500,1,2000").camera.fx == 500
+
+
+def test_a_foreign_error_that_says_nothing_is_told_by_its_kind() -> None:
+    assert first_line(EOFError()) == "EOFError"
+    assert first_line(RuntimeError("\n  out of paper  \nat line 3")) == "out of paper"

@@ -16,6 +16,7 @@ from typing import Any
 from improvo.errors import InputError, imported
 from improvo.jobs.processes import Job, Result, Tick
 from improvo.jobs.workers import ONE_THREAD, POLL_SECONDS, WorkerDiedError, with_errors_sent
+from improvo.untrusted.text import first_line
 
 _WAITING_PER_CORE = 2  # jobs handed to the cluster ahead of their turn
 _CANCEL_SECONDS = 10.0
@@ -141,8 +142,7 @@ def _result(ray: Any, reference: Any) -> Any:
         cause = error.cause
         return cause if isinstance(cause, Exception) else error
     except ray.exceptions.RayError as error:
-        reason = str(error).strip().splitlines()[0]
-        return WorkerDiedError(f"its Ray worker died ({type(error).__name__}: {reason}); run again")
+        return WorkerDiedError(f"its Ray worker died ({type(error).__name__}: {first_line(error)}); run again")
 
 
 def _cancel(ray: Any, references: list[Any]) -> None:

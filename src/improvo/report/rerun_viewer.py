@@ -25,6 +25,7 @@ from improvo.report.map_picture import map_colours
 from improvo.report.palettes import PALETTES, Palette
 from improvo.stability.rule import IGNORE
 from improvo.types import Float64, Frame, UInt8
+from improvo.untrusted.text import first_line
 
 _PROGRAM = "rerun"
 _OLD = 30  # frames; the last colour of the age of a track
@@ -201,8 +202,9 @@ class _Recording:
             try:
                 self._stream.spawn()
             except RuntimeError as error:
-                said = str(error).splitlines()[0]
-                raise OutputError(f"the live viewer does not start ({said}); save a file, and open it later") from None
+                raise OutputError(
+                    f"the live viewer does not start ({first_line(error)}); save a file, and open it later"
+                ) from None
         else:
             self._stream.save(str(self._files.enter_context(written_atomically(self._save))))
         self._log("world", self._rerun.ViewCoordinates.RDF, static=True)

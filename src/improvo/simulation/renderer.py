@@ -16,6 +16,7 @@ from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import rigid
 from improvo.simulation.scene import Scene
 from improvo.types import Float32, Float64, Int64, UInt8
+from improvo.untrusted.text import first_line
 
 _NEAR, _FAR = 0.05, 25.0  # metres
 _OPTIONS = """
@@ -126,7 +127,7 @@ def _import_mujoco() -> ModuleType:
 
 
 def _no_display(error: Exception) -> InputError:
-    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
     return InputError(
-        f"simulate: no OpenGL without a display ({reason}); install libosmesa6, or set MUJOCO_GL=egl with a driver"
+        f"simulate: no OpenGL without a display ({first_line(error)}); "
+        "install libosmesa6, or set MUJOCO_GL=egl with a driver"
     )

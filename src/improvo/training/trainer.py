@@ -31,6 +31,7 @@ from improvo.training.metrics import METRICS, append_metrics, keep_metrics
 from improvo.training.settings import OptimiserSettings
 from improvo.training.shared_statistics import share_batch_norm
 from improvo.training.stages.base import Stage
+from improvo.untrusted.text import first_line
 
 CHECKPOINT = "checkpoint.pt"
 
@@ -113,8 +114,9 @@ class Trainer:
         except ImprovoError:
             raise
         except Exception as error:  # torch raises many kinds; none of them is worth a traceback
-            reason = str(error).splitlines()[0]
-            raise InputError(f"{path}: cannot be continued from ({reason}); choose a new output folder") from None
+            raise InputError(
+                f"{path}: cannot be continued from ({first_line(error)}); choose a new output folder"
+            ) from None
         if self.process.leads:
             keep_metrics(self.folder / METRICS, self.step)
         return True
@@ -134,7 +136,7 @@ class Trainer:
             try:
                 torch.save(state, temporary)
             except RuntimeError as error:  # what torch makes of a full disk
-                raise OSError(f"is the disk full? {str(error).splitlines()[0]}") from None
+                raise OSError(f"is the disk full? {first_line(error)}") from None
 
     def run(self, progress: bool = True, on_checkpoint: Any = None) -> nn.Module:
         """Train up to the last step; returns the averaged network.

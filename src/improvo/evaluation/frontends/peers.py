@@ -19,6 +19,7 @@ from improvo.errors import MissingExtraError
 from improvo.frontend import Frontend
 from improvo.frontend.masking import without_masked
 from improvo.types import Features, Mask, UInt8
+from improvo.untrusted.text import first_line
 
 Extract = Callable[[Any], tuple[Any, Any, Any]]
 _CANDIDATES = 4  # times the keypoints, where a mask drops some of them
@@ -61,7 +62,7 @@ def load_peer(name: str, max_keypoints: int) -> Frontend:
         with contextlib.redirect_stdout(io.StringIO()):  # the packages print where their weights are
             return PeerFrontend(name, _PEERS[name], max_keypoints)
     except (ImportError, RuntimeError) as error:  # RuntimeError: a torchvision that does not fit the installed torch
-        raise MissingExtraError(f"frontend {name} ({str(error).splitlines()[0]})", "peers") from None
+        raise MissingExtraError(f"frontend {name} ({first_line(error)})", "peers") from None
 
 
 def _xfeat(max_keypoints: int) -> Extract:
