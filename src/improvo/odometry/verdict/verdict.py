@@ -14,7 +14,7 @@ from improvo.odometry.verdict.evidence import HALVES, PARTS, QUARTERS, Spread
 from improvo.odometry.verdict.seen_again import SeenAgain
 from improvo.types import Float64
 
-_SCALE_FACTOR = 6.0  # times what the parts disagree about a scale by (calibrated: docs/odometry.md)
+_SCALE_FACTOR = 6.0  # times what the parts disagree about a scale by (calibrated: docs/log-odometry.md)
 _COVERAGE = 1.15  # times the spread, for what all parts are off by together (docs/log-odometry.md)
 _USUAL_NOISE = 0.0016  # share of the picture's width; the estimate grows with noise that is larger
 _USUAL_SHARED = 0.0007  # the same of what neighbours are off by together: up to 0.0006 by a camera known roughly
