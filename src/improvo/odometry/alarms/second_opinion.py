@@ -29,7 +29,7 @@ from improvo.types import Float64
 Poses = Mapping[int, Float64]  # cam_from_world (4, 4) by frame index
 
 _LEAST_VIEWS = 3  # of a track: two views fit a point of their own under nearly any poses
-_BETTER = 1.1  # times as many tracks: less is chance (docs/odometry.md)
+_BETTER = 1.1  # times as many tracks: less is chance (docs/log-odometry.md)
 _SAME = 0.5  # of the error that a segment may have, and of one turn: two maps so near to each other are the same
 
 

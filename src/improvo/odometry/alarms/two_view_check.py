@@ -48,7 +48,7 @@ class TwoViewCheck:
     """Compares the map with two-view geometry every few frames.
 
     On five real sequences with three frontends a right map keeps at least 90 % of the two views' own inliers over
-    three checks; a mirrored or otherwise wrong one keeps at most 80 % (docs/odometry.md).
+    three checks; a mirrored or otherwise wrong one keeps at most 80 % (docs/log-odometry.md).
 
     Args:
         camera: pinhole camera of the views.

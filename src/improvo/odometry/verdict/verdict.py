@@ -14,12 +14,12 @@ from improvo.odometry.verdict.evidence import HALVES, PARTS, QUARTERS, Spread
 from improvo.odometry.verdict.seen_again import SeenAgain
 from improvo.types import Float64
 
-_SCALE_FACTOR = 6.0  # times what the parts disagree about a scale by (calibrated: docs/odometry.md)
-_COVERAGE = 1.15  # times the spread, for what all parts are off by together (docs/robustness-odometry.md)
+_SCALE_FACTOR = 6.0  # times what the parts disagree about a scale by (calibrated: docs/log-odometry.md)
+_COVERAGE = 1.15  # times the spread, for what all parts are off by together (docs/log-odometry.md)
 _USUAL_NOISE = 0.0016  # share of the picture's width; the estimate grows with noise that is larger
 _USUAL_SHARED = 0.0007  # the same of what neighbours are off by together: up to 0.0006 by a camera known roughly
 _USUAL_VIEWS = 4.0  # keyframes that observe a point; more of them average the noise
-_NOISE_POWER = 3  # noise of 1.4 times the usual one came with 3 to 5 times the spread (docs/robustness-odometry.md)
+_NOISE_POWER = 3  # noise of 1.4 times the usual one came with 3 to 5 times the spread (docs/log-odometry.md)
 _FOCAL_CHANGE = 0.12  # of the logarithm of the focal length, within a window or from one to the next
 _FOCAL_ERROR = 0.2  # of the logarithm of the focal length, from that of the camera as given
 _SIGMAS = 5.0  # standard errors that a deviation of the focal length must exceed
