@@ -20,8 +20,8 @@ from improvo.depth.dense import refuse_live, write_dense
 from improvo.depth.settings import DepthSettings
 from improvo.errors import InputError
 from improvo.geometry import se3
-from improvo.odometry.run import metres_per_unit
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
+from improvo.odometry.run.run_json import metres_per_unit
 from improvo.sequences import Sequence, open_sequence
 
 FRAMES = 30

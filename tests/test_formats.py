@@ -15,7 +15,7 @@ from improvo.formats import FORMAT, check_format
 from improvo.frontend.weights import load_weights, save_weights
 from improvo.improvement.validation import GapScores, Validation, read_validation, write_validation
 from improvo.labeling.labeled import read_labels
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
 from labeled_scene import write_labeled_scene
 from network_examples import random_weights
 

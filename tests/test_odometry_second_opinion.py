@@ -11,8 +11,8 @@ from simulated_features import CAMERA, hand_motion, observe, room, views_of
 from improvo.geometry import se3
 from improvo.odometry.alarms import second_opinion
 from improvo.odometry.alarms.second_opinion import SecondOpinion, explained_tracks, same_poses
-from improvo.odometry.events import EventLog
 from improvo.odometry.mapping.initial_pair import TWO_MOTIONS, InitFailure
+from improvo.odometry.result.events import EventLog
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
 from improvo.types import Float64

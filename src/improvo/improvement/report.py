@@ -285,7 +285,7 @@ def _draw_stability(
 def _draw_labels(
     target: Path, candidate: Candidate, part: Part, validation: Validation, settings: ImproveSettings
 ) -> None:
-    from improvo.odometry.run_folder import RunFolder
+    from improvo.odometry.run.run_folder import RunFolder
     from improvo.report.track_pictures import TrackPictureSettings, paint_labels
 
     done = [record for record in read_records(candidate.held_back) if record.state == DONE]

@@ -8,7 +8,8 @@ from pathlib import Path
 from improvo.errors import InputError
 from improvo.evaluation.truth.reference import lacks_times
 from improvo.geometry.trajectory_files import has_times, read_trajectory_report
-from improvo.odometry.run_folder import RunFolder, why_no_pose
+from improvo.odometry.run.run_folder import RunFolder
+from improvo.odometry.run.run_json import why_no_pose
 from improvo.sequences.base import SequenceSettings
 from improvo.sequences.opening import true_trajectory
 from improvo.types import Trajectory

@@ -18,10 +18,10 @@ from improvo.geometry import se3
 from improvo.geometry.alignment import align_points, path_length
 from improvo.geometry.camera import Camera
 from improvo.geometry.triangulation import triangulate_tracks
-from improvo.odometry.events import EventLog
 from improvo.odometry.gates import SAME_TURN_DEG
 from improvo.odometry.mapping.initial_pair import TWO_MOTIONS, InitFailure
 from improvo.odometry.mapping.start import start_map
+from improvo.odometry.result.events import EventLog
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
 from improvo.types import Float64
