@@ -22,6 +22,7 @@ from improvo.sequences.base import Recording, SequenceSettings
 from improvo.sequences.image_files import ImageFiles
 from improvo.sequences.images import list_images, listed_file
 from improvo.types import Float64, Trajectory, UInt8
+from improvo.untrusted.numbers import numbers
 
 _TRUTH = ("state_groundtruth_estimate0", "vicon0", "mocap0")
 
@@ -142,11 +143,7 @@ def _body_from_chain(path: Path, camera: str) -> Float64:
 
 
 def _rigid(values: object, path: Path, name: str) -> Float64:
-    try:
-        matrix = np.array(values, np.float64).reshape(1, 4, 4)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.full((1, 4, 4), np.nan)
-    pose = clean_poses(matrix)[0][0]
+    pose = clean_poses(numbers(values, 16).reshape(1, 4, 4))[0][0]
     if not np.isfinite(pose).all():
         raise InputError(f"{path}: {name} is no rigid 4x4 motion; repair it")
     return pose

@@ -21,9 +21,10 @@ from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameE
 from improvo.sequences.image_files import ImageFiles
 from improvo.sequences.images import listed_file, natural_key, read_depth
 from improvo.sequences.rates import frame_rate
-from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
+from improvo.sequences.varying_camera import median_calibration, read_json, trajectory_from_opengl
 from improvo.types import Float32, Float64, UInt8
 from improvo.untrusted.limits import MAX_PIXELS
+from improvo.untrusted.numbers import numbers
 
 _NAMES = ("transforms.json", "transforms_train.json")
 _NO_LENS = {

@@ -15,8 +15,9 @@ from improvo.geometry.trajectory_files import increasing_order
 from improvo.sequences.base import Recording, SequenceSettings
 from improvo.sequences.image_files import ImageFiles
 from improvo.sequences.images import list_images, read_depth
-from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
+from improvo.sequences.varying_camera import median_calibration, read_json, trajectory_from_opengl
 from improvo.types import Float32, UInt8
+from improvo.untrusted.numbers import numbers
 
 DEPTH_SCALE = 1000.0
 FPS = 10.0

@@ -17,10 +17,11 @@ from improvo.errors import InputError, installed
 from improvo.geometry.se3 import rigid, rotation_from_quat_xyzw
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
 from improvo.sequences.images import decode, depth_in_metres, natural_key
-from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
+from improvo.sequences.varying_camera import median_calibration, read_json, trajectory_from_opengl
 from improvo.types import Float32, Float64, UInt8
 from improvo.untrusted.arrays import FAULTS
 from improvo.untrusted.limits import MAX_ARRAY_BYTES, MAX_JSON_BYTES, MAX_PIXELS
+from improvo.untrusted.numbers import numbers
 from improvo.untrusted.paths import check_is_file
 from improvo.untrusted.text import reason
 
