@@ -108,6 +108,10 @@ def test_poses_without_common_frames_or_without_a_path_tell_nothing() -> None:
     assert not same_poses(poses_of(TRUTH), later, MAX_ERROR)
     still = poses_of(np.repeat(TRUTH[:1], FRAMES, axis=0))
     assert not same_poses(still, still, MAX_ERROR)
+    turning = TRUTH.copy()
+    turning[:, :3, 3] = 0.0
+    assert not same_poses(poses_of(turning), poses_of(TRUTH), MAX_ERROR)
+    assert not same_poses(poses_of(TRUTH), poses_of(turning), MAX_ERROR)
 
 
 @pytest.mark.parametrize("poses_contradicted", [True, False])
