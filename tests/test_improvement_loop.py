@@ -103,6 +103,9 @@ def test_the_best_weights_are_kept_and_the_report_is_there(
     assert rule(SETTINGS.validation) in page
     assert "the last 12 of 40 frames of room" in page
     assert "Kept: round 1; " in page
+    assert result.faults[:2] == ("", "")
+    assert result.kept == (1,)
+    assert f"Round 2 is not kept: {result.faults[2]}. Against the start: " in page
     assert page.count("data:image/png") == 4  # matches and labels of the start and of the best
     assert any(line.startswith("round 1: ") and line.endswith("better, kept") for line in lines)
     assert any(line.startswith("round 2: ") and line.endswith("), not kept") for line in lines)
