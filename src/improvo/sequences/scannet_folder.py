@@ -16,12 +16,12 @@ from improvo.geometry.camera_files import Calibration, folder_calibration
 from improvo.geometry.camera_files.calibration import checked
 from improvo.geometry.text_files import decoded, read_text
 from improvo.geometry.trajectory_files import clean_poses
-from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.base import SequenceSettings
+from improvo.sequences.image_files import ImageFiles, ImageFilesRecording
 from improvo.sequences.images import list_images, read_depth
 from improvo.sequences.rates import frame_rate
 from improvo.sequences.registration import intrinsics_of, register_depth, relative_extrinsics
-from improvo.types import Float32, Float64, Trajectory, UInt8
+from improvo.types import Float32, Float64, Trajectory
 from improvo.untrusted.names import number_of
 from improvo.untrusted.numbers import numbers
 from improvo.untrusted.paths import check_is_file
@@ -30,7 +30,7 @@ DEPTH_SCALE = 1000.0
 FPS = 30.0
 
 
-class ScanNetFolder(Recording):
+class ScanNetFolder(ImageFilesRecording):
     """An exported scene."""
 
     format = "scannet"
@@ -83,12 +83,6 @@ class ScanNetFolder(Recording):
             return False
         exported = (path / "color").is_dir() and ((path / "intrinsic").is_dir() or (path / "pose").is_dir())
         return exported or _info_file(path) is not None
-
-    def source(self, index: int) -> str:
-        return str(self._images.files[index])
-
-    def image(self, index: int) -> UInt8:
-        return self._images.read(index)
 
     def depth(self, index: int) -> Float32 | None:
         file = self._depth[index]
