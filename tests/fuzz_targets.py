@@ -170,7 +170,7 @@ def _archive_targets() -> dict[str, Target]:
     from improvo.evaluation.frontends.exported import _read_hdf5, _read_npz, to_features
     from improvo.evaluation.pose.cache import read_cache, write_cache
     from improvo.frontend.importing import read_public_file
-    from improvo.frontend.weights import load_weights, save_weights
+    from improvo.frontend.weights_files import load_weights, save_weights
     from improvo.geometry.camera_files import load_calibration
     from improvo.training.data.point_labels import PointLabels, load_labels, save_labels
     from improvo.types import Features

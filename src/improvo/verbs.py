@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from improvo.evaluation.settings import PoseSettings, TrajectorySettings
     from improvo.evaluation.trajectory.protocol import TrajectoryErrors
     from improvo.frontend import Frontend
-    from improvo.frontend.weights import DataSource
+    from improvo.frontend.weights_files import DataSource
     from improvo.improvement.improve import Improvement
     from improvo.improvement.settings import ImproveSettings
     from improvo.labeling.labeler import LabeledRun
@@ -186,7 +186,7 @@ def train_odometry(
         MissingExtraError: torch is not installed.
         InputError: no labels that teach anything.
     """
-    from improvo.frontend.weights import find_weights
+    from improvo.frontend.weights_files import find_weights
     from improvo.training.settings import OdometryTrainingSettings
 
     need_torch()

@@ -132,7 +132,7 @@ def run_onnx(arguments: argparse.Namespace) -> None:
     """A network with its decoding as one ONNX file: image in, keypoints, descriptors and stability out."""
     from improvo.export.onnx import export_onnx
     from improvo.frontend.settings import NetworkSettings
-    from improvo.frontend.weights import find_weights, load_weights
+    from improvo.frontend.weights_files import find_weights, load_weights
 
     given = {name: getattr(arguments, name) for name in _ONNX_SETTINGS if hasattr(arguments, name)}
     # the move to corners works on the image beside the network, and is no part of the file

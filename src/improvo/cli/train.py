@@ -118,7 +118,7 @@ def run_odometry(arguments: argparse.Namespace) -> None:
     check_output_folder(arguments.output, "train odometry")
     data = read_data_card(arguments.data_card)
     need_torch()
-    from improvo.frontend.weights import find_weights
+    from improvo.frontend.weights_files import find_weights
     from improvo.training.odometry_training import train_odometry
 
     start = find_weights(arguments.parent)

@@ -16,7 +16,7 @@ import numpy as np
 from improvo.errors import ConfigError
 from improvo.files import make_output_folder
 from improvo.folder_lock import locked
-from improvo.frontend.weights import load_weights, save_weights
+from improvo.frontend.weights_files import load_weights, save_weights
 from improvo.improvement.decision import rule, why_not_better
 from improvo.improvement.earlier import earlier_runs
 from improvo.improvement.estimate import refuse_full_disk
@@ -34,7 +34,7 @@ from improvo.sequences.given_files import with_absolute_files
 from improvo.terminal import counted
 
 if TYPE_CHECKING:
-    from improvo.frontend.weights import DataSource
+    from improvo.frontend.weights_files import DataSource
 
 
 @dataclass(frozen=True)

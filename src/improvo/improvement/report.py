@@ -8,7 +8,7 @@ from pathlib import Path
 
 from improvo.errors import InputError
 from improvo.files import write_png
-from improvo.frontend.weights import load_weights
+from improvo.frontend.weights_files import load_weights
 from improvo.improvement.decision import rule
 from improvo.improvement.folder import Candidate
 from improvo.improvement.settings import ImproveSettings, ValidationSettings
