@@ -85,7 +85,7 @@ def run(
         result = with_camera_note(result, settings.sequence.camera)
         if ask is not None:
             result = apply_scale(sequence, result, ask, scale)
-        if depth is not None:
+        if depth is not None and not result.report["interrupted"]:
             write_dense(sequence, result, depth)
     publish(folder)
     return result
