@@ -16,7 +16,7 @@ from improvo.evaluation.truth.reference import read_reference
 from improvo.evaluation.truth.referenced import open_with_truth
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
 from improvo.sequences import Sequence, SequenceSettings, open_sequence
 from improvo.types import Float32, Float64, Int64
 

@@ -31,7 +31,14 @@ from improvo.frontend.decoding import decode
 from improvo.frontend.network import NetworkFrontend, prepare
 from improvo.frontend.quantisation import calibrate
 from improvo.frontend.settings import NetworkSettings
-from improvo.frontend.weights import ModelCard, Weights, bundled_names, expected_shapes, find_weights, load_weights
+from improvo.frontend.weights_files import (
+    ModelCard,
+    Weights,
+    bundled_names,
+    expected_shapes,
+    find_weights,
+    load_weights,
+)
 from improvo.tracking.matching import mutual_nearest_neighbours
 from improvo.types import UInt8
 

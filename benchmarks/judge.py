@@ -37,7 +37,7 @@ from improvo.evaluation.pose.self_truth import FixedRun, choose_pairs
 from improvo.evaluation.statistics import Bootstrap
 from improvo.files import content_hash
 from improvo.frontend.registry import load_frontend
-from improvo.frontend.weights import find_weights, load_weights
+from improvo.frontend.weights_files import find_weights, load_weights
 from improvo.improvement.gaps import choose_gaps
 from improvo.improvement.reference import HELD_BACK, ReferencePart, reference_parts
 from improvo.improvement.rounds import calibration_images, write_calibrated

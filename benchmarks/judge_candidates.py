@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from improvo.frontend.weights import Weights, find_weights, load_weights, save_weights
+from improvo.frontend.weights_files import Weights, find_weights, load_weights, save_weights
 
 MIXED = (-0.5, 0.25, 0.5, 0.75, 1.5)  # of the way from the first to the second; beyond 0 to 1 it goes past them
 NOISE = (0.03, 0.06, 0.1, 0.15, 0.2)  # of every weight, relative

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from improvo.frontend.weights import load_weights
+from improvo.frontend.weights_files import load_weights
 
 # 130 in a shell; the others where it came before the command began, or through compiled code that Python remembers
 _INTERRUPTED = (130, -signal.SIGTERM, -signal.SIGINT)

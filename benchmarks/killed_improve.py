@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from improvo.frontend.weights import load_weights
+from improvo.frontend.weights_files import load_weights
 from improvo.simulation import bundled_sequence
 
 TABLES = ("tracks.parquet", "points.parquet", "frames.parquet", "trajectory.txt")

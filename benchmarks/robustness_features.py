@@ -17,7 +17,7 @@ import improvo.frontend
 from improvo.files import written_atomically
 from improvo.frontend import Frontend
 from improvo.frontend.registry import CLASSICAL
-from improvo.frontend.weights import find_weights
+from improvo.frontend.weights_files import find_weights
 from improvo.types import Features, Mask, UInt8
 
 

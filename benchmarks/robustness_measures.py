@@ -12,11 +12,11 @@ from improvo.errors import InputError
 from improvo.evaluation.trajectory.protocol import align, clean_truth
 from improvo.frontend import Frontend
 from improvo.geometry.se3 import rotation_angle_deg
-from improvo.odometry.events import Event
 from improvo.odometry.gates import STEP_FRAMES
-from improvo.odometry.segments import Segment
+from improvo.odometry.modes.states import TrackingState
+from improvo.odometry.result.events import Event
+from improvo.odometry.result.segments import Segment
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.states import TrackingState
 from improvo.odometry.verdict.verdict import RIGHT as RIGHT_WORD
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.types import Float64, Frame, Int64, Mask, Trajectory

@@ -78,7 +78,7 @@ def one_training(store: Path, output: Path, steps: int, frontend: str) -> dict[s
     """In a process of its own."""
     import numpy as np
 
-    from improvo.frontend.weights import find_weights
+    from improvo.frontend.weights_files import find_weights
     from improvo.labeling.labeled import read_labels
     from improvo.training.batches.tracked_pairs import TrackedPairs
     from improvo.training.data.label_library import LabelLibrary

@@ -17,7 +17,7 @@ import numpy as np
 
 from improvo.cli.train_options import read_data_card
 from improvo.frontend.quantisation import calibrate
-from improvo.frontend.weights import BUNDLED, DataSource, Weights, find_weights, load_weights, save_weights
+from improvo.frontend.weights_files import BUNDLED, DataSource, Weights, find_weights, load_weights, save_weights
 
 FIGURES = ("pairs", "rotation_success", "translation_success", "right_share_3px", "right_share_8px")
 NO_HEAD = "The stability head is not part of these weights: only VO adaptation can teach it. "

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from improvo.errors import ConfigError
-from improvo.frontend.weights import Weights, find_weights, load_weights, save_weights
+from improvo.frontend.weights_files import Weights, find_weights, load_weights, save_weights
 
 
 def combined(parts: list[tuple[str, Weights, float]]) -> Weights:

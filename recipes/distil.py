@@ -24,7 +24,7 @@ from improvo.frontend.channel_pruning import with_dead_channels, without_dead_ch
 from improvo.frontend.network import load_network_frontend, prepare
 from improvo.frontend.runtime_torch import load_network
 from improvo.frontend.superpoint import SuperPoint, sample_descriptors
-from improvo.frontend.weights import find_weights, load_weights, save_weights
+from improvo.frontend.weights_files import find_weights, load_weights, save_weights
 from improvo.training.data.pack import read_pack
 from improvo.training.device import choose_precision
 from improvo.training.stages.losses import held_loss

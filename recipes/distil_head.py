@@ -23,7 +23,7 @@ from improvo.frontend.architecture import CELL
 from improvo.frontend.network import NetworkFrontend, load_network_frontend, prepare
 from improvo.frontend.runtime_torch import load_network
 from improvo.frontend.superpoint import SuperPoint
-from improvo.frontend.weights import find_weights, load_weights, save_weights
+from improvo.frontend.weights_files import find_weights, load_weights, save_weights
 from improvo.simulation.causes import Cause
 from improvo.training.data.pack import read_pack
 from improvo.types import Float64, UInt8

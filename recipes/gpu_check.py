@@ -19,7 +19,7 @@ from torch.nn import functional
 from improvo.frontend.channel_pruning import without_dead_channels
 from improvo.frontend.runtime_torch import load_network
 from improvo.frontend.superpoint import heat_map
-from improvo.frontend.weights import find_weights, load_weights
+from improvo.frontend.weights_files import find_weights, load_weights
 from improvo.training.batches.device_pairs import DevicePairs
 from improvo.training.batches.teacher import network_teacher
 from improvo.training.data.pack import read_pack

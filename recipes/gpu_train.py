@@ -21,7 +21,7 @@ import yaml
 
 from improvo import files
 from improvo.config import from_dict, over
-from improvo.frontend.weights import find_weights
+from improvo.frontend.weights_files import find_weights
 from improvo.training.held_settings import HeldSettings
 from improvo.training.metrics import METRICS, read_metrics
 

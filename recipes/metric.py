@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 
-from improvo.frontend.weights import find_weights
+from improvo.frontend.weights_files import find_weights
 from improvo.training.data.pack import read_pack
 from improvo.training.metric_training import train_metric
 from improvo.training.stages.descriptor_metric import MetricSettings

@@ -170,7 +170,7 @@ def _archive_targets() -> dict[str, Target]:
     from improvo.evaluation.frontends.exported import _read_hdf5, _read_npz, to_features
     from improvo.evaluation.pose.cache import read_cache, write_cache
     from improvo.frontend.importing import read_public_file
-    from improvo.frontend.weights import load_weights, save_weights
+    from improvo.frontend.weights_files import load_weights, save_weights
     from improvo.geometry.camera_files import load_calibration
     from improvo.training.data.point_labels import PointLabels, load_labels, save_labels
     from improvo.types import Features
@@ -342,8 +342,9 @@ def _own_targets() -> dict[str, Target]:
     from improvo.improvement.validation import GapScores, Validation, read_validation, write_validation
     from improvo.labeling.frames import FRAMES_FILE, FramesTable, PackedImages, pack_images, read_frames, write_frames
     from improvo.labeling.labeled import read_labels
-    from improvo.odometry.map_file import read_map, write_map
-    from improvo.odometry.run_folder import RunFolder, why_no_pose
+    from improvo.odometry.run.map_file import read_map, write_map
+    from improvo.odometry.run.run_folder import RunFolder
+    from improvo.odometry.run.run_json import why_no_pose
     from improvo.sequences import SequenceSettings
     from improvo.stability.tables import (
         POINTS_FILE,

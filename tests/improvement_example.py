@@ -18,7 +18,7 @@ import numpy as np
 from improvo.evaluation.pose.self_truth import SelfTruthSettings
 from improvo.files import make_output_folder, write_json
 from improvo.frontend.settings import FrontendSettings
-from improvo.frontend.weights import Weights, find_weights, load_weights, save_weights
+from improvo.frontend.weights_files import Weights, find_weights, load_weights, save_weights
 from improvo.improvement.improve import Improvement, improve
 from improvo.improvement.recipe import TrainingJob
 from improvo.improvement.settings import ImproveSettings, SplitSettings, ValidationSettings

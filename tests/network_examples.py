@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from improvo.frontend.architecture import Architecture
-from improvo.frontend.weights import ModelCard, Weights, expected_shapes
+from improvo.frontend.weights_files import ModelCard, Weights, expected_shapes
 from improvo.types import Float32
 
 TINY = Architecture("tiny", encoder=(4, 4, 6, 6, 8, 8, 8, 8), head=12, descriptor=16)

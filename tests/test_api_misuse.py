@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import improvo
-from improvo.frontend.weights import find_weights, load_weights
+from improvo.frontend.weights_files import find_weights, load_weights
 from improvo.labeling.labeled import read_labels
 from improvo.simulation import bundled_sequence
 

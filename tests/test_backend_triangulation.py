@@ -203,7 +203,7 @@ import numpy as np
 from numba.core.registry import CPUDispatcher
 from simulated_features import CAMERA, hand_motion, observe, room
 from improvo.frontend.corners import refine_to_corners
-from improvo.odometry.compile import compile_odometry
+from improvo.odometry.run.compile import compile_odometry
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.stability.rule import label_stability
 

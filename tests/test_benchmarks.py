@@ -94,7 +94,7 @@ def test_where_the_truth_is_missing_nothing_is_wrong(
 ) -> None:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     import robustness_measures as measures
-    from improvo.odometry.segments import Segment
+    from improvo.odometry.result.segments import Segment
     from improvo.types import Trajectory
 
     def path(x: Any, y: Any) -> Any:

@@ -131,7 +131,7 @@ def test_a_disk_that_is_full(tmp_path: Path, command: str, needs: str, room: int
     out = tmp_path / "out"
     program = f"""
 import resource, sys
-import improvo.cli.run, improvo.odometry.run
+import improvo.cli.run, improvo.odometry.run.run_odometry
 from improvo.cli.main import main
 resource.setrlimit(resource.RLIMIT_FSIZE, ({room}, {room}))
 sys.exit(main([*{command.split()!r}, *{recording!r}, "-o", {str(out)!r}, "--quiet"]))

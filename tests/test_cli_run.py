@@ -267,6 +267,22 @@ class TestBadInput:
         assert 8 <= json.loads((out / "run.json").read_text())["frames"]["processed"] < 24
 
 
+def test_a_run_counts_the_pictures_that_a_list_names_and_that_are_not_there(
+    walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    listed = tmp_path / "listed"
+    (listed / "rgb").mkdir(parents=True)
+    names = [f"rgb/{row:04d}.png" for row in range(24)]
+    for name, picture in zip(names[:20], sorted(walk.glob("*.png")), strict=False):
+        (listed / name).write_bytes(picture.read_bytes())
+    (listed / "rgb.txt").write_text("".join(f"{row / 30:.6f} {name}\n" for row, name in enumerate(names)))
+    out = tmp_path / "out"
+    words = ["run", str(listed), "-o", str(out), "--camera", CAMERA_TEXT, "--frontend", "orb"]
+    assert main(words) == 0
+    assert f"note: {listed}: 20 of 24 listed pictures are there" in capsys.readouterr().out.splitlines()
+    assert json.loads((out / "run.json").read_text())["frames"]["processed"] == 20
+
+
 def test_demo_is_the_bundled_recording_unless_there_is_such_a_path(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["info", "demo", "--samples", "2"]) == 0

@@ -14,15 +14,17 @@ import pyarrow.parquet as pq
 import pytest
 from rendered_walk import write_walk
 
+import improvo
 from improvo.cli.main import main
 from improvo.depth.archive import DepthReader
 from improvo.depth.dense import refuse_live, write_dense
 from improvo.depth.settings import DepthSettings
 from improvo.errors import InputError
 from improvo.geometry import se3
-from improvo.odometry.run import metres_per_unit
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
+from improvo.odometry.run.run_json import metres_per_unit
 from improvo.sequences import Sequence, open_sequence
+from improvo.types import Features, Mask, UInt8
 
 FRAMES = 30
 QUICK = ("--frontend", "orb", "--max-keypoints", "500")
@@ -155,6 +157,24 @@ def test_an_interrupt_leaves_a_valid_part(walk: Path, dense: Path, tmp_path: Pat
     assert entry["frames"] == 7
     assert DepthReader(tmp_path / "out").frames == list(range(7))
     assert json.loads((tmp_path / "out" / "run.json").read_text())["depth"]["frames"] == 7
+
+
+def test_a_run_of_python_that_is_interrupted_goes_on_to_no_depth(walk: Path, tmp_path: Path) -> None:
+    orb = improvo.load_frontend("orb", 500)
+
+    class Interrupted:
+        name, frames = "orb", 0
+
+        def __call__(self, image: UInt8, mask: Mask | None = None) -> Features:
+            self.frames += 1
+            if self.frames == 20:
+                raise KeyboardInterrupt
+            return orb(image, mask)
+
+    run = improvo.run(walk, tmp_path / "out", improvo.DenseRunSettings(dense=True), Interrupted())
+    assert run.report["interrupted"]
+    assert 3 < run.tracked < 20
+    assert not (tmp_path / "out" / "depth.zip").exists()
 
 
 def test_frames_that_nothing_is_known_of_are_empty(walk: Path, dense: Path, tmp_path: Path) -> None:

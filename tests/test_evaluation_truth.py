@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import struct
 from pathlib import Path
@@ -10,8 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+import improvo
 from improvo.cli.main import main
 from improvo.errors import ConfigError, InputError
+from improvo.evaluation.settings import TrajectorySettings
 from improvo.evaluation.sources import Recorded
 from improvo.evaluation.truth.reference import read_reference, write_reference
 from improvo.evaluation.truth.referenced import open_with_truth
@@ -210,6 +213,30 @@ def test_a_trajectory_is_measured_against_the_reference(
     assert "6 poses at a common time" in capsys.readouterr().out
     assert main(["evaluate", "trajectory", str(estimate), str(truth_file)]) == 2
     assert "give the sequence as TRUTH, and this with --truth" in capsys.readouterr().err
+
+
+def test_python_measures_against_the_reference_as_the_command_does(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth_file = reference_file(tmp_path, "numbers")
+    poses = reference_poses()
+    poses[3, 0, 3] += 0.05
+    estimate = tmp_path / "estimate.txt"
+    write_trajectory(estimate, Trajectory(KNOWN / 30, poses))
+    settings = TrajectorySettings(alignment="none", time_windows=())
+    errors = improvo.evaluate_trajectory(estimate, recording, settings, reference=truth_file)
+    assert errors.poses == len(KNOWN)
+    assert errors.ate_m is not None
+    assert errors.ate_m.rmse == pytest.approx(0.05 / np.sqrt(len(KNOWN)), rel=1e-3)
+    words = ["evaluate", "trajectory", str(estimate), str(recording), "--alignment", "none", "--json"]
+    assert main([*words, "--truth", str(truth_file)]) == 0
+    assert json.loads(capsys.readouterr().out)["ate_m"]["rmse"] == errors.ate_m.rmse
+    part = improvo.evaluate_trajectory(estimate, recording, settings, SequenceSettings(end=6), truth_file)
+    assert part.poses == 3
+    with pytest.raises(InputError, match="reference"):
+        improvo.evaluate_trajectory(estimate, truth_file)
+    with pytest.raises(TypeError, match="recording"):
+        improvo.evaluate_trajectory(estimate, Trajectory(KNOWN / 30, poses), reference=truth_file)
 
 
 def test_the_number_of_truths_is_that_of_the_sequences(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:

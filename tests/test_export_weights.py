@@ -13,7 +13,7 @@ from improvo.cli.main import main
 from improvo.frontend.architecture import ARCHITECTURES, Architecture
 from improvo.frontend.network import NetworkFrontend
 from improvo.frontend.settings import NetworkSettings
-from improvo.frontend.weights import find_weights, load_weights, save_weights
+from improvo.frontend.weights_files import find_weights, load_weights, save_weights
 from network_examples import random_weights
 
 torch = pytest.importorskip("torch", reason="needs torch: pip install 'improvo[train]'")

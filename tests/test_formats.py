@@ -12,10 +12,10 @@ from improvo.cli.main import main
 from improvo.errors import InputError, OutputError
 from improvo.files import MARKER, check_output_folder, make_output_folder
 from improvo.formats import FORMAT, check_format
-from improvo.frontend.weights import load_weights, save_weights
+from improvo.frontend.weights_files import load_weights, save_weights
 from improvo.improvement.validation import GapScores, Validation, read_validation, write_validation
 from improvo.labeling.labeled import read_labels
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
 from labeled_scene import write_labeled_scene
 from network_examples import random_weights
 
@@ -94,13 +94,13 @@ def test_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     weights = random_weights()
     path = tmp_path / "w.safetensors"
     for written in (FORMAT, "1.7"):
-        monkeypatch.setattr("improvo.frontend.weights.FORMAT", written)
+        monkeypatch.setattr("improvo.frontend.weights_files.FORMAT", written)
         save_weights(path, weights.tensors, weights.card)
         assert load_weights(path).card == weights.card
     first = path.read_bytes()
     save_weights(path, weights.tensors, weights.card)
     assert path.read_bytes() == first
-    monkeypatch.setattr("improvo.frontend.weights.FORMAT", LATER)
+    monkeypatch.setattr("improvo.frontend.weights_files.FORMAT", LATER)
     save_weights(path, weights.tensors, weights.card)
     with pytest.raises(InputError, match=LATER_WORDS):
         load_weights(path)

@@ -12,7 +12,7 @@ from improvo.frontend.architecture import Architecture
 from improvo.frontend.channel_pruning import with_dead_channels, without_dead_channels
 from improvo.frontend.network import NetworkFrontend, prepare
 from improvo.frontend.settings import NetworkSettings
-from improvo.frontend.weights import ModelCard, Weights, load_weights, save_weights
+from improvo.frontend.weights_files import ModelCard, Weights, load_weights, save_weights
 from network_examples import TINY, random_weights
 
 WIDE = dataclasses.replace(TINY, name="wide", encoder=(8, 8, 8, 8, 8, 8, 8, 8))

@@ -11,7 +11,7 @@ import pytest
 
 from improvo.frontend.network import NetworkFrontend
 from improvo.frontend.settings import NetworkSettings
-from improvo.frontend.weights import BUNDLED, bundled_names, find_weights, load_weights
+from improvo.frontend.weights_files import BUNDLED, bundled_names, find_weights, load_weights
 from improvo.types import Float32, UInt8
 
 SETTINGS = NetworkSettings(max_keypoints=150, precision="float32")

@@ -20,7 +20,7 @@ from improvo.frontend.architecture import ARCHITECTURES
 from improvo.frontend.network import NetworkFrontend, prepare
 from improvo.frontend.quantisation import calibrate
 from improvo.frontend.settings import NetworkSettings
-from improvo.frontend.weights import save_weights
+from improvo.frontend.weights_files import save_weights
 from network_examples import TINY, lit_pixel_weights, random_weights
 
 LAYOUTS = ("none", "before_relu", "after_relu")

@@ -12,7 +12,7 @@ import pytest
 from improvo.cli.main import main
 from improvo.errors import ConfigError, InputError
 from improvo.frontend.network import load_network_frontend
-from improvo.frontend.weights import DataSource, ModelCard, Weights, load_weights, save_weights
+from improvo.frontend.weights_files import DataSource, ModelCard, Weights, load_weights, save_weights
 from network_examples import TINY, random_weights
 
 WIDTHS = (6, 6, 6, 6, 10, 10, 10, 10)  # the public networks' pattern, narrower

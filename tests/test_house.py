@@ -96,16 +96,31 @@ def test_a_room_says_which_other_rooms_it_imports() -> None:
     assert not wrong, "\n".join(wrong)
 
 
+def check_no_circle(wants: dict[str, set[str]]) -> None:
+    """Fail if places want each other in a circle; `wants` has those that each of them imports."""
+    while wants:
+        free = {place for place, others in wants.items() if not others & wants.keys()}
+        assert free, f"these import each other: {sorted(wants)}"
+        wants = {place: others for place, others in wants.items() if place not in free}
+
+
 def test_the_lowest_floor_has_no_circle() -> None:
     wants = {room: set() for room in FLOORS[0]}
     for file in sorted(PACKAGE.rglob("*.py")):
         room = room_of(file)
         if room in wants:
             wants[room] |= {other for _, other in imports(file) if other in wants and other != room}
-    while wants:
-        free = {room for room, others in wants.items() if not others & wants.keys()}
-        assert free, f"these import each other: {sorted(wants)}"
-        wants = {room: others for room, others in wants.items() if room not in free}
+    check_no_circle(wants)
+
+
+def test_the_folders_of_the_odometry_have_no_circle() -> None:
+    wants = {}
+    for file in sorted((PACKAGE / "odometry").rglob("*.py")):
+        place = file.relative_to(PACKAGE / "odometry").parts[0].removesuffix(".py")
+        modules = re.findall(r"from improvo\.odometry\.(\w+)", file.read_text())
+        wants[place] = wants.get(place, set()) | {other for other in modules if other != place}
+    assert {"modes", "mapping", "run"} <= wants.keys()
+    check_no_circle(wants)
 
 
 def test_every_room_has_a_floor() -> None:

@@ -21,7 +21,7 @@ from rendered_walk import write_walk
 
 from improvement_example import SETTINGS, FakeTraining, run
 from improvo.errors import ConfigError, ImprovoError, InputError, OutputError
-from improvo.frontend.weights import load_weights
+from improvo.frontend.weights_files import load_weights
 from improvo.improvement.decision import rule, why_not_better
 from improvo.improvement.improve import Improvement
 from improvo.improvement.progress import ImprovementProgress
@@ -103,6 +103,9 @@ def test_the_best_weights_are_kept_and_the_report_is_there(
     assert rule(SETTINGS.validation) in page
     assert "the last 12 of 40 frames of room" in page
     assert "Kept: round 1; " in page
+    assert result.faults[:2] == ("", "")
+    assert result.kept == (1,)
+    assert f"Round 2 is not kept: {result.faults[2]}. Against the start: " in page
     assert page.count("data:image/png") == 4  # matches and labels of the start and of the best
     assert any(line.startswith("round 1: ") and line.endswith("better, kept") for line in lines)
     assert any(line.startswith("round 2: ") and line.endswith("), not kept") for line in lines)
@@ -287,7 +290,7 @@ def test_of_several_sequences_whole_ones_are_held_back_and_bad_ones_are_named(wa
 def test_weights_without_activation_ranges_get_them_from_frames_that_are_not_held_back(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from improvo.frontend.weights import find_weights, save_weights
+    from improvo.frontend.weights_files import find_weights, save_weights
     from improvo.improvement import rounds
     from improvo.improvement.folder import ImproveFolder
 

@@ -75,7 +75,7 @@ def test_run(walk: Path, tmp_path: Path) -> None:
     calm, killed = tmp_path / "calm", tmp_path / "killed"
     words = ["run", str(walk), *ORB, "-o"]
     assert main([*words, str(calm), "--quiet"]) == 0
-    modules = "improvo.cli.run,improvo.odometry.run,improvo.odometry.compile"
+    modules = "improvo.cli.run,improvo.odometry.run.run_odometry,improvo.odometry.run.compile"
     statuses = killed_at_each_file([*words, str(killed)], modules, step=2)
     assert statuses[-1] == 0
     assert len(statuses) > 3

@@ -14,7 +14,7 @@ from improvement_example import SETTINGS as EXAMPLE
 from improvo.cli.main import main
 from improvo.cli.plan import duration, size, useful_workers
 from improvo.errors import InputError
-from improvo.frontend.weights import find_weights
+from improvo.frontend.weights_files import find_weights
 from improvo.improvement.estimate import Costs
 from improvo.improvement.plan import plan_improvement
 from improvo.improvement.plan_sample import measure

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from improvo.jobs import workers
-from improvo.odometry.ahead import detected_ahead
+from improvo.odometry.run.look_ahead import detected_ahead
 from improvo.odometry.visual_odometry import MatchedFeatures
 from improvo.types import Features, Frame
 

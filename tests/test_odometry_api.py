@@ -11,8 +11,8 @@ from rendered_walk import write_walk
 from simulated_features import CAMERA, hand_motion, observe, room
 
 from improvo.frontend.registry import load_frontend
+from improvo.odometry.modes.states import TrackingState
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.states import TrackingState
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.sequences import open_sequence
 from improvo.types import Features

@@ -14,9 +14,9 @@ from improvo.geometry.alignment import Similarity
 from improvo.odometry.mapping.bridging import Bridging, Join
 from improvo.odometry.mapping.camera_path import CameraPath
 from improvo.odometry.mapping.former_map import Sighting
-from improvo.odometry.result import OdometryResult
+from improvo.odometry.modes.states import TrackingState
+from improvo.odometry.result.odometry_result import OdometryResult
 from improvo.odometry.settings import BridgingSettings, OdometrySettings
-from improvo.odometry.states import TrackingState
 from improvo.odometry.view import View
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.types import Features, Float64, Mask

@@ -9,7 +9,8 @@ from simulated_features import CAMERA, hand_motion, observe, room, views_of
 from improvo.backend.settings import ObjectiveSettings, SolverSettings
 from improvo.geometry import se3
 from improvo.odometry.mapping.bundle_adjustment import adjust
-from improvo.odometry.view import PointStore, View
+from improvo.odometry.point_store import PointStore
+from improvo.odometry.view import View
 
 OBJECTIVE = ObjectiveSettings(depth_weight=0.0)
 SOLVER = SolverSettings(max_iterations=30)

@@ -11,11 +11,12 @@ from improvo.errors import ConfigError
 from improvo.frontend.registry import load_frontend
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
+from improvo.odometry.point_store import PointStore
 from improvo.odometry.refinement.anchors import Anchors
 from improvo.odometry.refinement.keypoint_refinement import KeypointRefiner, prepared
 from improvo.odometry.refinement.patch_alignment import REACH
 from improvo.odometry.settings import OdometrySettings, RefinementSettings
-from improvo.odometry.view import PointStore, View
+from improvo.odometry.view import View
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.sequences import open_sequence
 from improvo.simulation import bundled_sequence

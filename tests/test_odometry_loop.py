@@ -10,8 +10,9 @@ import pytest
 from simulated_features import CAMERA, error_percent, hand_motion, nothing_to_see, observe, room
 
 from improvo.geometry import se3
+from improvo.odometry.result.final_view import FinalView
 from improvo.odometry.settings import OdometrySettings, RansacGateSettings
-from improvo.odometry.view import FinalView, View
+from improvo.odometry.view import View
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.types import Features, Float64
 

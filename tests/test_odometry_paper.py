@@ -10,10 +10,11 @@ import pytest
 from simulated_features import CAMERA, World, error_percent, hand_motion, nothing_to_see, observe, room
 
 from improvo.geometry import se3
-from improvo.odometry import paper
+from improvo.odometry.modes import paper
+from improvo.odometry.modes.states import TrackingState
+from improvo.odometry.result.final_view import FinalView
 from improvo.odometry.settings import PAPER, OdometrySettings
-from improvo.odometry.states import TrackingState
-from improvo.odometry.view import FinalView, View
+from improvo.odometry.view import View
 from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
 from improvo.types import Features, Float64
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from improvo.config import from_dict, to_dict
-from improvo.odometry.paper import SOLVER
+from improvo.odometry.modes.paper import SOLVER
 from improvo.odometry.run_settings import LabelRunSettings, RunSettings, paper_run_settings
 from improvo.odometry.settings import PAPER, OdometrySettings
 

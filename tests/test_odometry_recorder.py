@@ -10,9 +10,9 @@ import pytest
 from improvo.backend.simulated import simulated_window
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.odometry import recorder
-from improvo.odometry.recorder import TrackRecorder
-from improvo.odometry.view import FinalView
+from improvo.odometry.result.final_view import FinalView
+from improvo.odometry.run import track_recorder
+from improvo.odometry.run.track_recorder import TrackRecorder
 from improvo.stability.rule import label_stability
 from improvo.stability.settings import LabelSettings
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, read_points, read_tracks
@@ -71,7 +71,7 @@ def record(folder: Path, views: list[FinalView], K: Float64) -> TrackRecorder:
 def test_tracks_have_the_labels_that_they_have_all_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flush_every: int
 ) -> None:
-    monkeypatch.setattr(recorder, "_FLUSH_EVERY", flush_every)
+    monkeypatch.setattr(track_recorder, "_FLUSH_EVERY", flush_every)
     tracks, cam_from_world, K = scene()
     lost = (11, 12)
     views = final_views(tracks, cam_from_world, lost)
@@ -99,10 +99,10 @@ def test_tracks_have_the_labels_that_they_have_all_at_once(
 
 def test_tracks_that_never_end_are_joined_once_a_flush(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A logo or a time stamp is one track of the whole recording, and is carried along to its end."""
-    monkeypatch.setattr(recorder, "_FLUSH_EVERY", 10)
+    monkeypatch.setattr(track_recorder, "_FLUSH_EVERY", 10)
     joined = []
-    join = recorder._Rows.joined
-    monkeypatch.setattr(recorder._Rows, "joined", lambda parts: joined.append(len(parts)) or join(parts))
+    join = track_recorder._Rows.joined
+    monkeypatch.setattr(track_recorder._Rows, "joined", lambda parts: joined.append(len(parts)) or join(parts))
     rng = np.random.default_rng(0)
     keypoints = rng.uniform(0, 400, (5, 2))
     views = []

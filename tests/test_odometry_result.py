@@ -10,14 +10,15 @@ from simulated_features import CAMERA
 
 from improvo.geometry import se3
 from improvo.geometry.alignment import Similarity
-from improvo.odometry.events import EventLog
-from improvo.odometry.map_builder import MapBuilder
 from improvo.odometry.mapping.bundle_adjustment import WindowReport
-from improvo.odometry.result import OdometryResult
-from improvo.odometry.segments import Segment, SegmentPlacement
-from improvo.odometry.trajectory_builder import TrajectoryBuilder
+from improvo.odometry.result.events import EventLog
+from improvo.odometry.result.final_view import FinalView
+from improvo.odometry.result.map_builder import MapBuilder
+from improvo.odometry.result.odometry_result import OdometryResult
+from improvo.odometry.result.segments import Segment, SegmentPlacement
+from improvo.odometry.result.trajectory_builder import TrajectoryBuilder
 from improvo.odometry.verdict.verdict import DOUBTFUL, RIGHT, Verdict
-from improvo.odometry.view import FinalView, View
+from improvo.odometry.view import View
 from improvo.types import Float64
 
 POINTS = np.array([[0.0, 0.0, 2.0], [0.2, 0.1, 2.0], [-0.3, 0.2, 4.0]])

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from simulated_features import CAMERA, error_percent, hand_motion, nothing_to_see, observe, room
 
-from improvo.odometry import robust
 from improvo.odometry.alarms import second_opinion
 from improvo.odometry.alarms.second_opinion import SecondOpinion
 from improvo.odometry.mapping.initial_pair import InitFailure
+from improvo.odometry.modes import robust
+from improvo.odometry.modes.states import TrackingState
+from improvo.odometry.result.final_view import FinalView
 from improvo.odometry.settings import BridgingSettings, OdometrySettings
-from improvo.odometry.states import TrackingState
-from improvo.odometry.view import FinalView, View
+from improvo.odometry.view import View
 from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
 from improvo.types import Features
 

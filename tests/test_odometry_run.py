@@ -14,8 +14,8 @@ from rendered_walk import write_walk
 from improvo.errors import InputError
 from improvo.frontend.registry import frontend_from
 from improvo.geometry.camera import Camera
-from improvo.odometry.run import run_odometry
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
+from improvo.odometry.run.run_odometry import run_odometry
 from improvo.odometry.run_settings import FrontendSettings, RunSettings
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View

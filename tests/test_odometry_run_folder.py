@@ -15,7 +15,8 @@ from rendered_walk import write_walk
 
 from improvo.cli.main import main
 from improvo.errors import InputError
-from improvo.odometry.run_folder import RunFolder, why_no_pose
+from improvo.odometry.run.run_folder import RunFolder
+from improvo.odometry.run.run_json import why_no_pose
 from improvo.stability.rule import IGNORE
 
 FRAMES = 30
@@ -182,7 +183,9 @@ def test_a_second_run_that_fails_before_its_first_file_leaves_the_first_one(
     assert (out / "run.json").read_bytes() == report
 
 
-@pytest.mark.parametrize("stopped_at", ["improvo.odometry.run.write_map", "improvo.labeling.labeler.write_json"])
+@pytest.mark.parametrize(
+    "stopped_at", ["improvo.odometry.run.run_odometry.write_map", "improvo.labeling.labeler.write_json"]
+)
 def test_a_second_run_that_is_stopped_between_its_files_is_no_result(
     out: Path, walk: Path, monkeypatch: pytest.MonkeyPatch, stopped_at: str
 ) -> None:

@@ -21,9 +21,9 @@ from improvo.errors import ConfigError, InputError, OutputError
 from improvo.geometry import se3
 from improvo.geometry.alignment import align_points
 from improvo.geometry.trajectory_files import read_trajectory, write_trajectory
-from improvo.odometry.map_file import read_map
-from improvo.odometry.run import RunSummary
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.map_file import read_map
+from improvo.odometry.run.run_folder import RunFolder
+from improvo.odometry.run.run_odometry import RunSummary
 from improvo.odometry.scale.apply import apply_scale, scaled_trajectory, segment_maps
 from improvo.odometry.scale.estimate import ScaleEstimate, from_measurements
 from improvo.odometry.scale.from_distance import scale_from_distance

@@ -11,8 +11,8 @@ from simulated_features import CAMERA, hand_motion, observe, room, views_of
 from improvo.geometry import se3
 from improvo.odometry.alarms import second_opinion
 from improvo.odometry.alarms.second_opinion import SecondOpinion, explained_tracks, same_poses
-from improvo.odometry.events import EventLog
 from improvo.odometry.mapping.initial_pair import TWO_MOTIONS, InitFailure
+from improvo.odometry.result.events import EventLog
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
 from improvo.types import Float64
@@ -108,6 +108,10 @@ def test_poses_without_common_frames_or_without_a_path_tell_nothing() -> None:
     assert not same_poses(poses_of(TRUTH), later, MAX_ERROR)
     still = poses_of(np.repeat(TRUTH[:1], FRAMES, axis=0))
     assert not same_poses(still, still, MAX_ERROR)
+    turning = TRUTH.copy()
+    turning[:, :3, 3] = 0.0
+    assert not same_poses(poses_of(turning), poses_of(TRUTH), MAX_ERROR)
+    assert not same_poses(poses_of(TRUTH), poses_of(turning), MAX_ERROR)
 
 
 @pytest.mark.parametrize("poses_contradicted", [True, False])

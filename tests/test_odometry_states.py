@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from improvo.odometry.states import StateMachine, TrackingState
+from improvo.odometry.modes.states import StateMachine, TrackingState
 
 
 def machine(*steps: str) -> StateMachine:

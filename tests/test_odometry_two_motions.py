@@ -10,7 +10,7 @@ from improvo.geometry import se3
 from improvo.geometry.a_contrario import disc_probability, line_probability, log10_false_alarms
 from improvo.geometry.epipolar import half_line_distances, sampson_errors
 from improvo.geometry.ransac import Ransac, relative_pose
-from improvo.odometry.alarms.two_motions import has_second_motion, holds_beside
+from improvo.odometry.mapping.two_motions import has_second_motion, holds_beside
 from improvo.types import Float64
 
 RANSAC = Ransac(1.0, seed=0, min_iterations=200, max_iterations=2000)

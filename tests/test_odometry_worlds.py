@@ -9,7 +9,7 @@ import pytest
 from simulated_features import CAMERA, World, error_percent, hand_motion, observe, room, wall
 
 from improvo.geometry import se3
-from improvo.odometry.states import TrackingState
+from improvo.odometry.modes.states import TrackingState
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.types import Features, Float64
 

@@ -21,8 +21,8 @@ from improvo.cli.main import main
 from improvo.export.model import segment_model
 from improvo.export.trajectory import export_trajectory
 from improvo.geometry.camera import Camera
-from improvo.odometry.map_file import read_map, write_map
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.map_file import read_map, write_map
+from improvo.odometry.run.run_folder import RunFolder
 from improvo.odometry.view import View
 from improvo.report import rerun_viewer
 from improvo.sequences import open_sequence, read_trajectory

@@ -15,7 +15,7 @@ from PIL import Image
 
 from improvo.cli.main import main
 from improvo.geometry.se3 import rigid, so3_exp
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
 from improvo.report.canvas import Canvas, captioned
 from improvo.report.map_picture import map_png
 from improvo.report.overhead import overhead_axes, robust_limits

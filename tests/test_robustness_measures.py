@@ -11,9 +11,9 @@ import pytest
 from simulated_features import CAMERA, hand_motion
 
 from improvo.geometry import se3
-from improvo.odometry.events import Event
-from improvo.odometry.segments import Segment
-from improvo.odometry.states import TrackingState
+from improvo.odometry.modes.states import TrackingState
+from improvo.odometry.result.events import Event
+from improvo.odometry.result.segments import Segment
 from improvo.odometry.verdict.verdict import RIGHT, Verdict
 from improvo.types import Float64, Trajectory
 

@@ -80,6 +80,7 @@ def test_round_trip_is_exact(tmp_path: Path, name: str) -> None:
         assert (frame.image == expected.images[i]).all()
         assert frame.source_index == i
     assert not sequence.skipped
+    assert sequence.present.tolist() == sequence.indices.tolist()
     for i in (3, 0, 5, 2):
         assert (sequence[i].image == expected.images[i]).all()
         depth = sequence.depth(i)

@@ -87,6 +87,21 @@ def test_unreadable_frames_are_named(tmp_path: Path) -> None:
     assert "cannot be read" in said(findings)
 
 
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_pictures_that_a_list_names_and_that_are_not_there_are_counted(tmp_path: Path, calibrated: bool) -> None:
+    write_tum(tmp_path, 12)
+    assert not any("listed" in note for note in survey(tmp_path, SequenceSettings()).facts["notes"])
+    if not calibrated:
+        (tmp_path / "camera.yaml").unlink()
+    for picture in sorted((tmp_path / "rgb").iterdir())[4:]:
+        picture.unlink()
+    facts = survey(tmp_path, SequenceSettings()).facts
+    assert facts["notes"] == [f"{tmp_path}: 4 of 12 listed pictures are there"]
+    assert (facts["camera"] is not None) == calibrated
+    some = survey(tmp_path, SequenceSettings(end=4)).facts
+    assert not some["notes"], "of the frames that are asked for"
+
+
 def test_command_prints_text_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_tum(tmp_path, 6)
     assert main(["info", str(tmp_path)]) == 0

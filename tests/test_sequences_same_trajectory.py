@@ -65,6 +65,7 @@ def test_every_lossless_format_gives_the_same_trajectory(tmp_path: Path, simulat
         assert sequence.format == name.split()[0]
         assert sequence.camera == simulated.camera
         assert sequence.times.tolist() == simulated.times.tolist()
+        assert sequence.present.tolist() == list(range(FRAMES))
         assert all((frame.image == image).all() for frame, image in zip(sequence, simulated.images, strict=True))
         if name in ("tum", "video"):
             # equal inputs give equal outputs, so two runs are enough

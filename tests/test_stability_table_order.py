@@ -16,7 +16,7 @@ from rendered_walk import write_walk
 
 from improvo.cli.main import main
 from improvo.export.model import segment_model
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
 from improvo.stability.rule import IGNORE
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, read_points, read_tracks
 from labeled_scene import write_labeled_scene

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from improvo.frontend.network import load_network_frontend
-from improvo.frontend.weights import BUNDLED, bundled_names, load_weights
+from improvo.frontend.weights_files import BUNDLED, bundled_names, load_weights
 from improvo.training.settings import PhotometricSettings
 from improvo.types import Float32, UInt8
 from shape_detection import ScoredDetector, classical_detectors, mean_average_precision, shape_tests

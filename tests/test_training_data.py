@@ -9,7 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from improvo.cli.main import whole_parser
+from improvo.cli.options import pictures_source
 from improvo.errors import InputError
+from improvo.simulation import bundled_sequence
 from improvo.training.augmentation.views import inside, random_view, warp_points
 from improvo.training.data.pictures import Pictures, Source, load_pictures
 from improvo.training.data.point_labels import (
@@ -169,6 +172,20 @@ def test_unreadable_pictures_are_named_and_counted(tmp_path: Path) -> None:
     assert len(pictures) == 1
     assert pictures.sources[0].weight == 3
     assert pictures.skipped == (str(tmp_path / "b.png"),)
+
+
+def test_demo_is_a_source_as_it_is_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["train", "homographies", "demo", "demo=2", "photographs=3", "-o", "out"]
+    sources = whole_parser().parse_args(words).sources
+    assert sources == [str(bundled_sequence()), f"{bundled_sequence()}=2", "photographs=3"]
+    source = load_pictures(sources[1:2]).sources[0]
+    assert (len(source.pictures), source.weight) == (140, 2)
+    words = ["train", "odometry", "labels", "--pictures", "demo=2", "-o", "out"]
+    assert whole_parser().parse_args(words).pictures == sources[1:2]
+    for name in ("demo", "demo=2"):
+        (tmp_path / name).mkdir()
+        assert pictures_source(name) == name
 
 
 def test_folders_without_a_picture_are_refused(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("torch", reason="training needs the extra `train`")
 
-from improvo.frontend.weights import find_weights, load_weights
+from improvo.frontend.weights_files import find_weights, load_weights
 from labeled_scene import write_labeled_scene
 
 WORDS = ["--from", "superpoint-small", "--workers", "0", "--threads", "1"]

@@ -16,7 +16,7 @@ from posed_room import posed_room  # noqa: E402
 from improvo.frontend.network import NetworkFrontend  # noqa: E402
 from improvo.frontend.runtime_torch import load_network  # noqa: E402
 from improvo.frontend.settings import NetworkSettings  # noqa: E402
-from improvo.frontend.weights import Weights, find_weights, load_weights  # noqa: E402
+from improvo.frontend.weights_files import Weights, find_weights, load_weights  # noqa: E402
 from improvo.improvement.settings import ImproveSettings  # noqa: E402
 from improvo.training.batches.elsewhere import BUNDLED_SOURCE, HeldElsewhere, bundled_pictures  # noqa: E402
 from improvo.training.data.pictures import Pictures  # noqa: E402

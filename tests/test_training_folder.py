@@ -17,7 +17,7 @@ torch = pytest.importorskip("torch", reason="training needs the extra `train`")
 from improvo.cli.main import main  # noqa: E402
 from improvo.errors import OutputError  # noqa: E402
 from improvo.folder_lock import LOCK, holder_of, locked  # noqa: E402
-from improvo.frontend.weights import load_weights  # noqa: E402
+from improvo.frontend.weights_files import load_weights  # noqa: E402
 from improvo.training.distributed import Process  # noqa: E402
 from improvo.training.metrics import METRICS, append_metrics, keep_metrics, read_metrics  # noqa: E402
 

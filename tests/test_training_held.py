@@ -19,7 +19,7 @@ from posed_room import SIZE, posed_room  # noqa: E402
 from improvo.errors import ConfigError, InputError  # noqa: E402
 from improvo.frontend.architecture import ARCHITECTURES  # noqa: E402
 from improvo.frontend.superpoint import SuperPoint  # noqa: E402
-from improvo.frontend.weights import DataSource, find_weights, load_weights  # noqa: E402
+from improvo.frontend.weights_files import DataSource, find_weights, load_weights  # noqa: E402
 from improvo.training.augmentation.photometric_batch import augment_batch  # noqa: E402
 from improvo.training.augmentation.views import inside, warp_image, warp_points  # noqa: E402
 from improvo.training.augmentation.views_batch import random_views  # noqa: E402

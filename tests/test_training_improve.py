@@ -16,7 +16,7 @@ from rendered_walk import write_walk
 
 from improvo.cli.main import main
 from improvo.frontend.network import load_network_frontend
-from improvo.frontend.weights import load_weights, save_weights
+from improvo.frontend.weights_files import load_weights, save_weights
 
 COMMAND = [
     *("--frontend", "superpoint-small", "--max-keypoints", "250", "--steps", "6", "--batch-size", "2"),

@@ -11,7 +11,7 @@ import pytest
 from improvo import files
 from improvo.errors import ConfigError, InputError
 from improvo.frontend.channel_pruning import with_dead_channels
-from improvo.frontend.weights import Weights, find_weights, load_weights, save_weights
+from improvo.frontend.weights_files import Weights, find_weights, load_weights, save_weights
 from improvo.improvement.recipe import stages
 from improvo.improvement.settings import HELD, METRIC, TRACKS, ImproveSettings
 from improvo.training.interpolated_weights import interpolated, write_interpolated

@@ -12,7 +12,7 @@ from posed_room import posed_room
 from improvo.errors import ConfigError, InputError
 from improvo.frontend.network import NetworkFrontend
 from improvo.frontend.settings import NetworkSettings
-from improvo.frontend.weights import find_weights, load_weights
+from improvo.frontend.weights_files import find_weights, load_weights
 from improvo.tracking.matching import mutual_nearest_neighbours
 from improvo.training.stages.descriptor_metric import MetricSettings, Scatter, found_again, with_descriptor_map
 from improvo.types import Features

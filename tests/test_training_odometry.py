@@ -16,7 +16,7 @@ from improvo.cli.main import main  # noqa: E402
 from improvo.frontend.architecture import Architecture  # noqa: E402
 from improvo.frontend.runtime_torch import load_network  # noqa: E402
 from improvo.frontend.superpoint import SuperPoint, sample_stability  # noqa: E402
-from improvo.frontend.weights import ModelCard, load_weights, save_weights  # noqa: E402
+from improvo.frontend.weights_files import ModelCard, load_weights, save_weights  # noqa: E402
 from improvo.labeling.labeled import read_labels  # noqa: E402
 from improvo.stability.rule import IGNORE, STABLE, UNSTABLE  # noqa: E402
 from improvo.training.batches.tracked_pairs import TrackedPairs  # noqa: E402

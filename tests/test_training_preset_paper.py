@@ -17,7 +17,7 @@ from torch.nn import functional  # noqa: E402
 from improvo.cli.main import main  # noqa: E402
 from improvo.frontend.architecture import Architecture  # noqa: E402
 from improvo.frontend.superpoint import SuperPoint, sample_descriptors, sample_stability  # noqa: E402
-from improvo.frontend.weights import ModelCard, load_weights, save_weights  # noqa: E402
+from improvo.frontend.weights_files import ModelCard, load_weights, save_weights  # noqa: E402
 from improvo.labeling.labeled import read_labels  # noqa: E402
 from improvo.presets import preset  # noqa: E402
 from improvo.stability.rule import STABLE, UNSTABLE  # noqa: E402

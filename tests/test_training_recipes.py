@@ -24,7 +24,7 @@ from improvo.frontend.network import load_network_frontend
 from improvo.frontend.registry import load_frontend
 from improvo.frontend.runtime_torch import load_network
 from improvo.frontend.settings import NetworkOptions
-from improvo.frontend.weights import DataSource, find_weights, load_weights
+from improvo.frontend.weights_files import DataSource, find_weights, load_weights
 from improvo.simulation.causes import Cause
 from improvo.training.data.pack import write_pack
 from improvo.training.data.pictures import Pictures, Source

@@ -16,7 +16,7 @@ torch = pytest.importorskip("torch", reason="training needs the extra `train`")
 from improvo.cli.main import main  # noqa: E402
 from improvo.frontend.architecture import ARCHITECTURES, Architecture  # noqa: E402
 from improvo.frontend.superpoint import SuperPoint  # noqa: E402
-from improvo.frontend.weights import load_weights  # noqa: E402
+from improvo.frontend.weights_files import load_weights  # noqa: E402
 from improvo.training.batches.drawn_shapes import ShapeBatches, shape_source  # noqa: E402
 from improvo.training.batches.homography_pairs import PairBatches  # noqa: E402
 from improvo.training.settings import HomographiesSettings, OptimiserSettings, ShapesSettings, ViewSettings  # noqa: E402

@@ -26,7 +26,7 @@ from improvo.files import check_output_folder, write_text
 from improvo.geometry.camera_files import calibration_yaml, load_calibration
 from improvo.geometry.text_files import read_text
 from improvo.geometry.trajectory_files import read_times, read_trajectory
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
 from improvo.odometry.run_settings import RunSettings
 from improvo.sequences import SequenceSettings, open_sequence
 from improvo.sequences.base import UnreadableFrameError

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from improvo.frontend.settings import FrontendSettings, NetworkOptions
     from improvo.geometry.camera import Camera
     from improvo.improvement.settings import ImproveSettings
-    from improvo.odometry.run_folder import RunFolder
+    from improvo.odometry.run.run_folder import RunFolder
     from improvo.odometry.run_settings import LabelRunSettings, RunSettings
     from improvo.odometry.settings import OdometrySettings
     from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
@@ -54,7 +54,7 @@ _PUBLIC = {
     "TrackedFrame": "improvo.odometry.visual_odometry",
     "Trajectory": "improvo.types",
     "SparseMap": "improvo.types",
-    "RunFolder": "improvo.odometry.run_folder",
+    "RunFolder": "improvo.odometry.run.run_folder",
     # verbs
     "open_sequence": "improvo.sequences",
     "load_frontend": "improvo.frontend.registry",

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from improvo.evaluation.settings import PoseSettings, TrajectorySettings
     from improvo.evaluation.trajectory.protocol import TrajectoryErrors
     from improvo.frontend import Frontend
-    from improvo.frontend.weights import DataSource
+    from improvo.frontend.weights_files import DataSource
     from improvo.improvement.improve import Improvement
     from improvo.improvement.settings import ImproveSettings
     from improvo.labeling.labeler import LabeledRun
@@ -85,7 +85,7 @@ def run(
         result = with_camera_note(result, settings.sequence.camera)
         if ask is not None:
             result = apply_scale(sequence, result, ask, scale)
-        if depth is not None:
+        if depth is not None and not result.report["interrupted"]:
             write_dense(sequence, result, depth)
     publish(folder)
     return result
@@ -186,7 +186,7 @@ def train_odometry(
         MissingExtraError: torch is not installed.
         InputError: no labels that teach anything.
     """
-    from improvo.frontend.weights import find_weights
+    from improvo.frontend.weights_files import find_weights
     from improvo.training.settings import OdometryTrainingSettings
 
     need_torch()
@@ -327,7 +327,11 @@ def evaluate_pose(
 
 
 def evaluate_trajectory(
-    estimate: Trajectory | PathLike, truth: Trajectory | PathLike, settings: TrajectorySettings | None = None
+    estimate: Trajectory | PathLike,
+    truth: Trajectory | PathLike,
+    settings: TrajectorySettings | None = None,
+    sequence_settings: SequenceSettings | None = None,
+    reference: PathLike | None = None,
 ) -> TrajectoryErrors:
     """Errors of a trajectory against the truth (paper, Table 2), as `improvo evaluate trajectory` has them.
 
@@ -336,11 +340,15 @@ def evaluate_trajectory(
         truth: poses, a trajectory file, the output folder of a run, or a sequence that has true poses; it needs no
             calibration.
         settings: alignment and the lengths of sub-trajectories.
+        sequence_settings: how the sequence is read, where `truth` is one.
+        reference: true poses that replace those of the sequence `truth`, and say by frame numbers or image names
+            which frames they belong to: a file of `improvo truth` (`truth-sfm.txt`) or the folder of a COLMAP model;
+            or a TUM trajectory.
 
     Rows of a KITTI file without times are taken as the rows of the other, one by one.
 
     Raises:
-        TypeError: neither poses nor a path.
+        TypeError: neither poses nor a path, or a reference without a sequence.
         InputError: a file that is no trajectory, a sequence without true poses, rows without times of which the
             other has another number, or no common time.
     """
@@ -348,7 +356,10 @@ def evaluate_trajectory(
     from improvo.evaluation.trajectory.pair import read_pair
     from improvo.evaluation.trajectory.protocol import evaluate_trajectory as errors_of
 
-    ours, true, _ = read_pair(_poses_or_path(estimate), _poses_or_path(truth))
+    own, against = _poses_or_path(estimate), _poses_or_path(truth)
+    if reference is not None and not isinstance(against, Path):
+        raise TypeError("reference: its poses belong to frames of a recording; give its path as `truth`")
+    ours, true, _ = read_pair(own, against, sequence_settings, reference)
     names = (_name_of(estimate, "the estimate"), _name_of(truth, "the truth"))
     return errors_of(ours, true, settings or TrajectorySettings(), names)
 

@@ -37,7 +37,7 @@ def with_found_camera(settings: T, recordings: Sequence[Path], folder: Path | No
         return settings
     from improvo.errors import InputError
     from improvo.files import make_output_folder, remove_unused_folder
-    from improvo.odometry.compile import compile_odometry
+    from improvo.odometry.run.compile import compile_odometry
     from improvo.self_calibration.found_cameras import find_cameras
     from improvo.terminal import stages
 

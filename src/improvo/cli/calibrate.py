@@ -98,7 +98,7 @@ def _from_motion(arguments: argparse.Namespace, settings: SelfCalibrationSetting
     """Find the camera from the video itself; `camera.yaml`, and all figures beside it as JSON."""
     from dataclasses import replace
 
-    from improvo.odometry.compile import compile_odometry
+    from improvo.odometry.run.compile import compile_odometry
     from improvo.self_calibration.from_motion import camera_from_motion
     from improvo.sequences.opening import open_recording
     from improvo.terminal import stages

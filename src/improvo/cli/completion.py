@@ -9,11 +9,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from improvo.cli.options import folder_path, read_folder_path, recording_path
+from improvo.cli.options import folder_path, pictures_source, read_folder_path, recording_path
 from improvo.errors import imported
 
 _SHELLS = ("bash", "zsh", "fish")
-_OF_FILES = (Path, recording_path, folder_path, read_folder_path)  # types of arguments that are paths
+_OF_FILES = (Path, recording_path, pictures_source, folder_path, read_folder_path)  # types of arguments that are paths
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -107,7 +107,7 @@ def loaded_frontends(
     """
     from improvo.evaluation.sources import LoadedFrontend
     from improvo.frontend.registry import CLASSICAL
-    from improvo.frontend.weights import bundled_names
+    from improvo.frontend.weights_files import bundled_names
 
     asked = asked or list(default)
     named = [name for name in asked if name != "all"]

@@ -14,7 +14,7 @@ from improvo.files import check_output_file, is_same_file
 
 if TYPE_CHECKING:
     from improvo.export.model import Model
-    from improvo.odometry.run_folder import RunFolder
+    from improvo.odometry.run.run_folder import RunFolder
     from improvo.types import UInt8
 
 _ONNX_SETTINGS = ("max_keypoints", "threshold", "nms_radius", "border", "subpixel_radius")
@@ -32,7 +32,7 @@ def run_colmap(arguments: argparse.Namespace) -> None:
     from improvo.export.colmap import write_colmap
     from improvo.export.model import segment_model, segments_by_length
     from improvo.folder_lock import working_in
-    from improvo.odometry.run_folder import RunFolder
+    from improvo.odometry.run.run_folder import RunFolder
 
     _check_model_arguments(arguments)
     run_folder = RunFolder(arguments.folder, arguments.sequence)
@@ -73,7 +73,7 @@ def run_nerfstudio(arguments: argparse.Namespace) -> None:
     from improvo.export.model import segment_model, segments_by_length
     from improvo.export.nerfstudio import write_nerfstudio
     from improvo.folder_lock import working_in
-    from improvo.odometry.run_folder import RunFolder
+    from improvo.odometry.run.run_folder import RunFolder
 
     _check_model_arguments(arguments)
     run_folder = RunFolder(arguments.folder, arguments.sequence)
@@ -99,7 +99,7 @@ def add_trajectory_arguments(parser: argparse.ArgumentParser) -> None:
 def run_trajectory(arguments: argparse.Namespace) -> None:
     """Write the poses that there are."""
     from improvo.export.trajectory import export_trajectory
-    from improvo.odometry.run_folder import RunFolder
+    from improvo.odometry.run.run_folder import RunFolder
 
     run_folder = RunFolder(arguments.folder)
     target = target_path(arguments.output, arguments.output, _FILE_NAMES[arguments.format], (".txt", ".csv"))
@@ -132,7 +132,7 @@ def run_onnx(arguments: argparse.Namespace) -> None:
     """A network with its decoding as one ONNX file: image in, keypoints, descriptors and stability out."""
     from improvo.export.onnx import export_onnx
     from improvo.frontend.settings import NetworkSettings
-    from improvo.frontend.weights import find_weights, load_weights
+    from improvo.frontend.weights_files import find_weights, load_weights
 
     given = {name: getattr(arguments, name) for name in _ONNX_SETTINGS if hasattr(arguments, name)}
     # the move to corners works on the image beside the network, and is no part of the file

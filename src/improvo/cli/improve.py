@@ -148,7 +148,7 @@ def run(arguments: argparse.Namespace) -> int:
     from improvo.improvement.improve import improve
     from improvo.improvement.progress import ImprovementProgress
     from improvo.improvement.validation import gain_words
-    from improvo.odometry.compile import compile_odometry
+    from improvo.odometry.run.compile import compile_odometry
 
     compile_odometry(notice)
     compile_depth(notice)
@@ -182,7 +182,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _plan(arguments: argparse.Namespace, settings: ImproveSettings) -> int:
     """Measure a sample; nothing is left but cameras that were looked for, in the user's cache."""
     from improvo.improvement.plan import plan_improvement
-    from improvo.odometry.compile import compile_odometry
+    from improvo.odometry.run.compile import compile_odometry
     from improvo.terminal import progress
 
     settings = with_found_camera(settings, [*arguments.sequences, *arguments.evaluate], None, "improve")

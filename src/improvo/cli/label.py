@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError("-o LABELS: is missing; it is the folder of the label store")
     from improvo.labeling.label_sequences import label_sequences
     from improvo.labeling.store import DONE
-    from improvo.odometry.compile import compile_odometry
+    from improvo.odometry.run.compile import compile_odometry
     from improvo.terminal import progress
 
     settings = with_found_camera(settings, arguments.sequences, arguments.output, "label")
@@ -136,7 +136,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _plan(arguments: argparse.Namespace, settings: LabelRunSettings) -> int:
     """Measure a sample; nothing is left but cameras that were looked for, in the user's cache."""
     from improvo.labeling.plan import plan_labels
-    from improvo.odometry.compile import compile_odometry
+    from improvo.odometry.run.compile import compile_odometry
     from improvo.terminal import progress
 
     settings = with_found_camera(settings, arguments.sequences, None, "label")

@@ -91,6 +91,14 @@ def recording_path(text: str) -> Path:
     return bundled_sequence()
 
 
+def pictures_source(text: str) -> str:
+    """A source of pictures, `SOURCE` or `SOURCE=WEIGHT`; `demo` is the bundled recording as in `recording_path`."""
+    name, separator, weight = text.partition("=")
+    if name != "demo" or (separator and Path(text).exists()):
+        return text
+    return f"{recording_path(name)}{separator}{weight}"
+
+
 def recording_words(path: Path) -> str:
     """A recording as the user would type it in a command: the bundled one is `demo`, wherever it lies."""
     from improvo.simulation import bundled_sequence

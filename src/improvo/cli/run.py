@@ -158,7 +158,7 @@ def _scale_source(sequence: Sequence, settings: DenseRunSettings) -> Ask | None:
 def _track(sequence: Sequence, folder: Path, settings: DenseRunSettings, viewer: RerunViewer | None) -> LabeledRun:
     """The run with its progress."""
     from improvo.labeling.labeler import run_and_label
-    from improvo.odometry.compile import compile_odometry
+    from improvo.odometry.run.compile import compile_odometry
     from improvo.self_calibration.found_cameras import with_camera_note
     from improvo.terminal import progress
 
@@ -211,7 +211,7 @@ def _scale_lines(report: dict[str, Any]) -> list[str]:
 
 
 def _print_summary(summary: LabeledRun) -> None:
-    from improvo.odometry.run_folder import why_no_pose
+    from improvo.odometry.run.run_json import why_no_pose
     from improvo.odometry.verdict.told_verdicts import verdict_lines, what_doubt_means
 
     report = summary.report

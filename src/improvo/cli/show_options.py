@@ -13,7 +13,7 @@ from improvo.files import check_output_file
 from improvo.terminal import counted
 
 if TYPE_CHECKING:
-    from improvo.odometry.run_folder import RunFolder
+    from improvo.odometry.run.run_folder import RunFolder
     from improvo.types import UInt8
 
 _EVENLY = "6"  # frames of a sheet

@@ -152,7 +152,7 @@ def _add_recording(parser: argparse.ArgumentParser, default: str) -> None:
 
 def _opened_sequence(arguments: argparse.Namespace) -> tuple[Sequence, str | None]:
     """The sequence of a command that takes a recording or the output folder of a run, and the run's frontend."""
-    from improvo.odometry.run_folder import RunFolder
+    from improvo.odometry.run.run_folder import RunFolder
     from improvo.odometry.run_settings import RunSettings
     from improvo.sequences import open_sequence
 

@@ -35,7 +35,7 @@ def add_map_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_map(arguments: argparse.Namespace) -> None:
     """Trajectory and map from above."""
-    from improvo.odometry.run_folder import RunFolder
+    from improvo.odometry.run.run_folder import RunFolder
     from improvo.report.map_picture import draw_map
     from improvo.report.palettes import palette
 
@@ -61,7 +61,7 @@ def run_frames(arguments: argparse.Namespace) -> None:
     """A sheet, PNG files or a video of tracks, residuals or labels."""
     from functools import partial
 
-    from improvo.odometry.run_folder import RunFolder
+    from improvo.odometry.run.run_folder import RunFolder
     from improvo.report import track_pictures
     from improvo.report.palettes import palette
 
@@ -92,7 +92,7 @@ def add_live_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_live(arguments: argparse.Namespace) -> None:
     """A finished run in Rerun."""
-    from improvo.odometry.run_folder import RunFolder
+    from improvo.odometry.run.run_folder import RunFolder
     from improvo.report.palettes import palette
     from improvo.report.rerun_viewer import show_run
 

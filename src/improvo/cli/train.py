@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from improvo.cli.flags import add_setting
-from improvo.cli.options import read_folder_path, settings_from
+from improvo.cli.options import pictures_source, read_folder_path, settings_from
 from improvo.cli.output import typed
 from improvo.cli.train_options import (
     add_data_card,
@@ -47,7 +47,11 @@ def add_homographies_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `improvo train homographies`."""
     defaults = HomographiesSettings()
     parser.add_argument(
-        "sources", nargs="+", metavar="SOURCE[=WEIGHT]", help="image folder or sequence; a higher weight is seen more"
+        "sources",
+        nargs="+",
+        type=pictures_source,
+        metavar="SOURCE[=WEIGHT]",
+        help="image folder or sequence; a higher weight is seen more",
     )
     parser.add_argument(
         "--detector", metavar="WEIGHTS", help="label the pictures with this detector: a file, or a bundled name"
@@ -93,6 +97,7 @@ def add_odometry_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--pictures",
         nargs="+",
+        type=pictures_source,
         default=[],
         metavar="SOURCE[=WEIGHT]",
         help="image folders or sequences to train on beside the labels, as homography pairs, so that the network stays "
@@ -113,7 +118,7 @@ def run_odometry(arguments: argparse.Namespace) -> None:
     check_output_folder(arguments.output, "train odometry")
     data = read_data_card(arguments.data_card)
     need_torch()
-    from improvo.frontend.weights import find_weights
+    from improvo.frontend.weights_files import find_weights
     from improvo.training.odometry_training import train_odometry
 
     start = find_weights(arguments.parent)

@@ -14,7 +14,7 @@ from improvo.untrusted.paths import check_is_file
 from improvo.untrusted.text import load_json, reason
 
 if TYPE_CHECKING:
-    from improvo.frontend.weights import DataSource
+    from improvo.frontend.weights_files import DataSource
     from improvo.training.data.pictures import Pictures
 
 
@@ -66,7 +66,7 @@ def read_data_card(path: Path | None) -> tuple[DataSource, ...]:
     """
     if path is None:
         return ()
-    from improvo.frontend.weights import DataSource
+    from improvo.frontend.weights_files import DataSource
 
     try:
         sources = tuple(DataSource(**entry) for entry in load_json(check_is_file(path).read_text(encoding="utf-8")))
@@ -86,7 +86,7 @@ def starting_weights(parent: str | None) -> Path | None:
     """
     if parent is None:
         return None
-    from improvo.frontend.weights import find_weights
+    from improvo.frontend.weights_files import find_weights
 
     return find_weights(parent)
 

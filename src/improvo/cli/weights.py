@@ -63,7 +63,7 @@ def _add_weights(parser: argparse.ArgumentParser) -> None:
 def run_import(arguments: argparse.Namespace) -> None:
     """Convert a public file."""
     from improvo.frontend.importing import convert, read_public_file
-    from improvo.frontend.weights import save_weights
+    from improvo.frontend.weights_files import save_weights
 
     output = _checked_output(arguments.output)
     licence = arguments.licence or "unknown: ask whoever released the original file"
@@ -86,7 +86,7 @@ def run_export(arguments: argparse.Namespace) -> None:
     """
     from improvo.export.weights_layouts import export_weights, left_out
     from improvo.files import check_output_folder
-    from improvo.frontend.weights import find_weights, load_weights
+    from improvo.frontend.weights_files import find_weights, load_weights
 
     output: Path = arguments.output
     if arguments.layout == "transformers":
@@ -111,7 +111,7 @@ def run_export(arguments: argparse.Namespace) -> None:
 def run_calibrate(arguments: argparse.Namespace) -> None:
     """Measure activation ranges and write them beside the weights."""
     from improvo.frontend.quantisation import calibrate
-    from improvo.frontend.weights import find_weights, load_weights, save_weights
+    from improvo.frontend.weights_files import find_weights, load_weights, save_weights
     from improvo.sequences.base import UnreadableFrameError
     from improvo.sequences.images import read_grey
     from improvo.terminal import progress
@@ -148,7 +148,7 @@ def run_calibrate(arguments: argparse.Namespace) -> None:
 def run_show(arguments: argparse.Namespace) -> None:
     """Print the model card."""
     from improvo import config
-    from improvo.frontend.weights import find_weights, load_weights
+    from improvo.frontend.weights_files import find_weights, load_weights
 
     card = load_weights(find_weights(arguments.weights)).card
     print(json.dumps(config.to_dict(card), indent=2))

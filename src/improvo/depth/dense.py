@@ -19,7 +19,8 @@ from improvo.depth.sparse_depths import ranges_of_run
 from improvo.errors import InputError
 from improvo.files import write_json
 from improvo.geometry import se3
-from improvo.odometry.run import RunSummary, metres_per_unit
+from improvo.odometry.run.run_json import metres_per_unit
+from improvo.odometry.run.run_odometry import RunSummary
 from improvo.sequences import Sequence
 from improvo.sequences.images import grey
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE

@@ -154,7 +154,7 @@ def _version(package: str) -> str | None:
 
 def _weights_digest(name: str) -> str | None:
     """SHA-256 of the weights file behind a frontend's name; None for those without one of ours."""
-    from improvo.frontend.weights import bundled_names, find_weights
+    from improvo.frontend.weights_files import bundled_names, find_weights
 
     if name not in bundled_names() and not name.endswith(".safetensors"):
         return None

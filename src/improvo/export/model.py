@@ -11,8 +11,8 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.files import write_png
 from improvo.geometry import se3
-from improvo.odometry.point_colours import UNKNOWN
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.point_colours import UNKNOWN
+from improvo.odometry.run.run_folder import RunFolder
 from improvo.types import Float64, Int64, UInt8
 
 

@@ -12,7 +12,7 @@ from improvo.frontend.architecture import CELL
 from improvo.frontend.channel_pruning import without_dead_channels
 from improvo.frontend.onnx_graph import NetworkNodes, OnnxGraph, add_heat_map
 from improvo.frontend.settings import NetworkSettings
-from improvo.frontend.weights import Weights
+from improvo.frontend.weights_files import Weights
 
 
 def export_onnx(weights: Weights, path: Path, settings: NetworkSettings, layout: str = "improvo") -> None:

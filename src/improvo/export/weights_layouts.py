@@ -24,7 +24,7 @@ from improvo.frontend.architecture import Architecture
 from improvo.frontend.channel_pruning import with_dead_channels
 from improvo.frontend.importing import LAYOUTS, Layout
 from improvo.frontend.settings import NetworkSettings
-from improvo.frontend.weights import Weights
+from improvo.frontend.weights_files import Weights
 
 NAMES = ("original", "rpautrat", "transformers")
 FILES = (".pth", ".pt", ".safetensors")  # of the layouts that are a file

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from improvo.frontend.architecture import Architecture
-from improvo.frontend.weights import Weights, expected_shapes
+from improvo.frontend.weights_files import Weights, expected_shapes
 from improvo.types import Float32
 
 _ZERO_IN_A_DEAD_CHANNEL = ("convolution.weight", "convolution.bias", "norm.weight", "norm.bias")

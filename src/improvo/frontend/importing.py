@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from improvo.errors import ConfigError, InputError, MissingExtraError, imported
 from improvo.frontend.architecture import Architecture, Normalisation
-from improvo.frontend.weights import ModelCard, Weights
+from improvo.frontend.weights_files import ModelCard, Weights
 from improvo.types import Float32, Float64
 from improvo.untrusted.arrays import check_array
 from improvo.untrusted.limits import MAX_WEIGHTS_BYTES

@@ -16,7 +16,7 @@ from improvo.frontend.decoding import decode, stability_map
 from improvo.frontend.masking import check_image, check_mask
 from improvo.frontend.runtime import Runtime, open_runtime
 from improvo.frontend.settings import NetworkSettings
-from improvo.frontend.weights import Weights, find_weights, load_weights
+from improvo.frontend.weights_files import Weights, find_weights, load_weights
 from improvo.types import Features, Float32, Mask
 
 Image = NDArray[Any]  # (H, W) or (H, W, 3) blue-green-red; uint8, or float in [0, 1]

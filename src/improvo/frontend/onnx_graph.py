@@ -19,7 +19,7 @@ from improvo.frontend.int8 import (
     largest_of_channels,
     spread_over_copies,
 )
-from improvo.frontend.weights import FoldedLayer, Weights
+from improvo.frontend.weights_files import FoldedLayer, Weights
 from improvo.types import Float32
 
 OPSET = 17

@@ -8,7 +8,7 @@ from dataclasses import replace
 from improvo.errors import InputError
 from improvo.frontend.network import Image, prepare
 from improvo.frontend.runtime import cpu_runtime
-from improvo.frontend.weights import Weights
+from improvo.frontend.weights_files import Weights
 
 
 def calibrate(weights: Weights, images: Iterable[Image], quantile: float = 0.9999) -> Weights:

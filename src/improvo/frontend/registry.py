@@ -87,7 +87,7 @@ def check_frontend(name: str, network: NetworkOptions | None = None) -> None:
     if name not in NETWORKS and Path(name).suffix != ".safetensors":
         known = ", ".join((*NETWORKS, *CLASSICAL))
         raise ConfigError(f"frontend {name!r}: unknown; choose among {known}, or give a .safetensors weights file")
-    from improvo.frontend.weights import find_weights
+    from improvo.frontend.weights_files import find_weights
 
     find_weights(name)
 

@@ -8,7 +8,7 @@ from improvo.errors import ConfigError, MissingExtraError, installed
 from improvo.frontend.channel_pruning import without_dead_channels
 from improvo.frontend.decoding import NetworkMaps
 from improvo.frontend.settings import NetworkOptions, NetworkSettings
-from improvo.frontend.weights import Weights
+from improvo.frontend.weights_files import Weights
 from improvo.jobs.workers import thread_limit
 from improvo.types import Float32
 

@@ -10,7 +10,7 @@ import numpy as np
 from improvo.errors import imported
 from improvo.frontend.decoding import NetworkMaps
 from improvo.frontend.onnx_graph import NetworkNodes, OnnxGraph, add_heat_map
-from improvo.frontend.weights import Weights
+from improvo.frontend.weights_files import Weights
 from improvo.types import Float32
 
 _FEATURE = "the ONNX runtime"

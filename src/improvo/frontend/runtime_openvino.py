@@ -21,7 +21,7 @@ from improvo.frontend.int8 import (
 from improvo.frontend.openvino_library import CORE, plain_letters
 from improvo.frontend.openvino_library import openvino as ov
 from improvo.frontend.openvino_library import opset13 as ops
-from improvo.frontend.weights import Weights
+from improvo.frontend.weights_files import Weights
 from improvo.types import Float32
 
 _KEPT_SIZES = 4

@@ -8,7 +8,7 @@ import numpy as np
 
 from improvo.errors import ConfigError, MissingExtraError
 from improvo.frontend.decoding import NetworkMaps
-from improvo.frontend.weights import Weights
+from improvo.frontend.weights_files import Weights
 from improvo.types import Float32
 
 try:

@@ -27,7 +27,7 @@ class SuperPoint(nn.Module):
         batch_norm: build the batch norm that the architecture names; False leaves it out (folded weights).
 
     Parameters are named `encoder.N`, `detector.N`, `descriptor.N`, `stability.N`, each with `.convolution` and, on the
-    3×3 ones, `.norm`. `state_dict()` is what a weights file holds (`improvo.frontend.weights`); inference folds
+    3×3 ones, `.norm`. `state_dict()` is what a weights file holds (`improvo.frontend.weights_files`); inference folds
     the norm.
     """
 

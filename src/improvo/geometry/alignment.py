@@ -73,3 +73,9 @@ def align_points(target: Float64, source: Float64, with_scale: bool) -> Similari
 def path_length(positions: Float64) -> float:
     """From the first of positions (N, 3) along all to the last."""
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+
+def path_lengths(positions: Float64) -> Float64:
+    """Distance travelled (N,) up to each of the positions (N, D)."""
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])

@@ -16,7 +16,7 @@ import numpy as np
 from improvo.errors import ConfigError
 from improvo.files import make_output_folder
 from improvo.folder_lock import locked
-from improvo.frontend.weights import load_weights, save_weights
+from improvo.frontend.weights_files import load_weights, save_weights
 from improvo.improvement.decision import rule, why_not_better
 from improvo.improvement.earlier import earlier_runs
 from improvo.improvement.estimate import refuse_full_disk
@@ -34,7 +34,7 @@ from improvo.sequences.given_files import with_absolute_files
 from improvo.terminal import counted
 
 if TYPE_CHECKING:
-    from improvo.frontend.weights import DataSource
+    from improvo.frontend.weights_files import DataSource
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,13 @@ class Improvement:
     best: int  # its row in the following
     candidates: tuple[Candidate, ...]  # the first is the start
     validations: tuple[Validation, ...]
-    kept: tuple[int, ...] = ()  # the rounds that were better than all before them, of which the best is made
+    faults: tuple[str, ...]  # what each lacks to be better than all before it, in words; empty where it is
     control: tuple[Candidate, Validation] | None = None  # the start, trained by homographies alone, as many rounds
+
+    @property
+    def kept(self) -> tuple[int, ...]:
+        """The rounds that were better than all before them, of which the best is made."""
+        return tuple(number for number, faults in enumerate(self.faults) if number > 0 and not faults)
 
 
 def improve(
@@ -107,7 +112,7 @@ def improve(
         replayed, judged_before = earlier.parts(TRAINING), earlier.parts(HELD_BACK)
         new_teaching, new_judging = loop.reference(split)
         teaching, judging = new_teaching + replayed, new_judging + judged_before
-        result = Improvement(folder.weights, 0, (start,), (loop.validate(start, split.held_back, judging),))
+        result = Improvement(folder.weights, 0, (start,), (loop.validate(start, split.held_back, judging),), ("",))
         progress.validated(start, result.validations[0], result.validations[0], settings.validation)
         _keep(result, folder, split, settings)
         for number in range(1, max(most, folder.finished_rounds()) + 1):
@@ -127,9 +132,9 @@ def improve(
             result = replace(
                 result,
                 best=result.best if faults else number,
-                kept=result.kept if faults else (*result.kept, number),
                 candidates=(*result.candidates, candidate),
                 validations=(*result.validations, validation),
+                faults=(*result.faults, faults),
             )
             _keep(result, folder, split, settings)
         if settings.control:
@@ -166,7 +171,8 @@ def _keep(result: Improvement, folder: ImproveFolder, split: Split, settings: Im
     best, validation = result.candidates[result.best], result.validations[result.best]
     measures = summary(validation, result.validations[0], settings.validation)
     _publish(best, folder.weights, rule(settings.validation), measures)
-    write_report(folder.report, result.candidates, result.validations, result.best, split, settings, result.control)
+    judged = result.candidates, result.validations, result.faults
+    write_report(folder.report, *judged, result.best, split, settings, result.control)
 
 
 def _publish(best: Candidate, target: Path, words: str, measures: dict[str, float]) -> None:

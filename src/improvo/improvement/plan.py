@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from improvo.errors import InputError
-from improvo.frontend.weights import load_weights
+from improvo.frontend.weights_files import load_weights
 from improvo.improvement.earlier import earlier_runs
 from improvo.improvement.estimate import Costs, Estimate, estimate
 from improvo.improvement.plan_sample import measure

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from improvo.frontend.weights import load_weights, save_weights
+from improvo.frontend.weights_files import load_weights, save_weights
 from improvo.improvement.reference import ReferencePart
 from improvo.improvement.settings import HELD, METRIC, TRACKS, ImproveSettings
 from improvo.labeling.store import DONE, read_records
 
 if TYPE_CHECKING:
-    from improvo.frontend.weights import DataSource
+    from improvo.frontend.weights_files import DataSource
     from improvo.training.data.posed_sequence import PosedSequence
 
 _FEWEST = 300  # steps, however short the training part is

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from improvo.errors import InputError
 from improvo.files import write_png
-from improvo.frontend.weights import load_weights
-from improvo.improvement.decision import rule, why_not_better
+from improvo.frontend.weights_files import load_weights
+from improvo.improvement.decision import rule
 from improvo.improvement.folder import Candidate
 from improvo.improvement.settings import ImproveSettings, ValidationSettings
 from improvo.improvement.split import Part, Split
@@ -29,6 +29,7 @@ def write_report(
     path: Path,
     candidates: Sequence[Candidate],
     validations: Sequence[Validation],
+    faults: Sequence[str],
     best: int,
     split: Split,
     settings: ImproveSettings,
@@ -39,6 +40,7 @@ def write_report(
     Args:
         path: the HTML file.
         candidates, validations: of the start, then of every round.
+        faults: why each of them is not kept, in words; empty where it is.
         best: which of them is kept.
         split: what was held back.
         settings: of the loop.
@@ -62,7 +64,7 @@ def write_report(
         rounds,
         _notes(candidates, validations, split, settings),
         best,
-        _verdict(candidates, validations, best, settings, control),
+        _verdict(candidates, validations, faults, best, settings, control),
         _gains([*zip(candidates, validations, strict=True), *([control] if control else [])], settings.validation),
     )
 
@@ -180,6 +182,7 @@ def _gains(judged: Sequence[tuple[Candidate, Validation]], settings: ValidationS
 def _verdict(
     candidates: Sequence[Candidate],
     validations: Sequence[Validation],
+    faults: Sequence[str],
     best: int,
     settings: ImproveSettings,
     control: tuple[Candidate, Validation] | None,
@@ -191,13 +194,10 @@ def _verdict(
         lines.append(f"Kept: {candidates[best].name}; against the start: {gained}.")
     elif len(candidates) > 1:
         lines.append("No round was better than the start: the weights kept are those at the start, unchanged.")
-    before = start
-    for candidate, validation in zip(candidates[1:], validations[1:], strict=True):
-        faults = why_not_better(validation, before, start, how)
-        if faults:
+    for candidate, validation, lacking in zip(candidates, validations, faults, strict=True):
+        if lacking:
             gained = gain_words(validation, start, how.matches)
-            lines.append(f"{candidate.name.capitalize()} is not kept: {faults}. Against the start: {gained}.")
-        before = before if faults else validation
+            lines.append(f"{candidate.name.capitalize()} is not kept: {lacking}. Against the start: {gained}.")
     if control:
         gained = gain_words(control[1], start, how.matches)
         words = "The control, trained for as many rounds and steps on the same frames by homographies alone"
@@ -285,7 +285,7 @@ def _draw_stability(
 def _draw_labels(
     target: Path, candidate: Candidate, part: Part, validation: Validation, settings: ImproveSettings
 ) -> None:
-    from improvo.odometry.run_folder import RunFolder
+    from improvo.odometry.run.run_folder import RunFolder
     from improvo.report.track_pictures import TrackPictureSettings, paint_labels
 
     done = [record for record in read_records(candidate.held_back) if record.state == DONE]

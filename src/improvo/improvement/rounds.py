@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from improvo.errors import ConfigError, InputError, OutputError
-from improvo.frontend.weights import find_weights, load_weights, save_weights
+from improvo.frontend.weights_files import find_weights, load_weights, save_weights
 from improvo.improvement.folder import Candidate, ImproveFolder
 from improvo.improvement.measuring import pairs_of, validate
 from improvo.improvement.progress import ImprovementProgress
@@ -48,7 +48,7 @@ from improvo.sequences import SequenceSettings, open_sequence
 from improvo.types import UInt8
 
 if TYPE_CHECKING:
-    from improvo.frontend.weights import DataSource
+    from improvo.frontend.weights_files import DataSource
 
 
 class Rounds:

@@ -2,8 +2,8 @@
 some.
 
 `improvo run` and `improvo label` both do it here, so that the same settings give the same `points.parquet`. The rule is
-applied to each track while the odometry runs, as soon as the track has ended (`improvo.odometry.recorder`), so that
-memory stays bounded. The gate comes at the end, and reads what was written a part at a time.
+applied to each track while the odometry runs, as soon as the track has ended (`odometry/run/track_recorder.py`), so
+that memory stays bounded. The gate comes at the end, and reads what was written a part at a time.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from improvo.labeling.quality import (
     frame_medians,
     withhold_labels,
 )
-from improvo.odometry.run import RunSummary, run_odometry
+from improvo.odometry.run.run_odometry import RunSummary, run_odometry
 from improvo.odometry.verdict.told_verdicts import doubtful_frames
 from improvo.stability.settings import LabelSettings
 from improvo.stability.tables import (

@@ -12,17 +12,18 @@ from improvo.frontend import Frontend
 from improvo.frontend.registry import CLASSICAL
 from improvo.geometry.camera import Camera
 from improvo.odometry.alarms.world_keypoints import WorldKeypoints
-from improvo.odometry.checks import OneThread, check_features, check_frame, check_parts, check_time
-from improvo.odometry.events import Event, EventLog
-from improvo.odometry.mapper import Mapper
-from improvo.odometry.paper import PaperMapper
+from improvo.odometry.input_checks import OneThread, check_features, check_frame, check_parts, check_time
+from improvo.odometry.modes.mapper import Mapper
+from improvo.odometry.modes.paper import PaperMapper
+from improvo.odometry.modes.robust import RobustMapper
+from improvo.odometry.modes.states import TrackingState
 from improvo.odometry.refinement.keypoint_refinement import prepared
-from improvo.odometry.result import OdometryResult
-from improvo.odometry.robust import RobustMapper
-from improvo.odometry.segments import Segment
+from improvo.odometry.result.events import Event, EventLog
+from improvo.odometry.result.final_view import FinalView
+from improvo.odometry.result.odometry_result import OdometryResult
+from improvo.odometry.result.segments import Segment
 from improvo.odometry.settings import OdometrySettings, RefinementSettings
-from improvo.odometry.states import TrackingState
-from improvo.odometry.view import FinalView, View
+from improvo.odometry.view import View
 from improvo.tracking.connect import TrackChain
 from improvo.tracking.matching import distance_threshold, match_units, unit_descriptors, without_flow_outliers
 from improvo.types import Features, Float32, Float64, Frame, Int64, SparseMap, Trajectory, UInt8

@@ -10,7 +10,7 @@ import numpy as np
 
 from improvo.errors import PLOTS_MISSING, plots_installed
 from improvo.labeling.store import DONE, read_records
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
 from improvo.report.map_picture import map_png
 from improvo.report.page import Page, plain
 from improvo.report.palettes import PALETTES, Palette

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from improvo.errors import InputError, require_plots
 from improvo.files import written_atomically
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
 from improvo.report.overhead import overhead_axes, robust_limits
 from improvo.report.palettes import PALETTES, Palette
 from improvo.report.true_path import TruePath, true_path

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from improvo.errors import InputError
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
 from improvo.report.map_picture import LAST_POSES, map_colours, trusted_points
 from improvo.report.overhead import overhead_axes, robust_limits
 from improvo.report.palettes import Palette

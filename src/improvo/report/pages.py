@@ -26,7 +26,7 @@ def write_report(
     if sequence_path is not None and not (folder / "run.json").is_file():
         raise ConfigError(f"--sequence {sequence_path}: belongs to the folder of a run, and {folder} is none")
     if (folder / "run.json").is_file():
-        from improvo.odometry.run_folder import RunFolder
+        from improvo.odometry.run.run_folder import RunFolder
         from improvo.report.run_page import write_run_page
 
         write_run_page(RunFolder(folder, sequence_path), path, palette)

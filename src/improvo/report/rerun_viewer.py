@@ -19,7 +19,7 @@ from improvo.errors import OutputError, imported
 from improvo.files import check_output_file, written_atomically
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
 from improvo.odometry.view import View
 from improvo.report.map_picture import map_colours
 from improvo.report.palettes import PALETTES, Palette

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from improvo.errors import PLOTS_MISSING, InputError, plots_installed
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
 from improvo.odometry.verdict.told_verdicts import verdict_lines, verdict_of
 from improvo.odometry.verdict.verdict import DOUBTFUL
 from improvo.report.charts import line_chart

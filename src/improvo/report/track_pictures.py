@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from improvo.errors import ConfigError
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
 from improvo.report.canvas import Canvas
 from improvo.report.palettes import PALETTES, Palette
 from improvo.stability.rule import IGNORE, STABLE, UNSTABLE

@@ -10,7 +10,7 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.evaluation.settings import TrajectorySettings
 from improvo.evaluation.trajectory.protocol import aligned_segments, clean_truth, total_errors
-from improvo.odometry.run_folder import RunFolder
+from improvo.odometry.run.run_folder import RunFolder
 from improvo.types import Float64, Int64, Trajectory
 
 _GAP = 10  # poses from one with truth to the next, which a line may bridge

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from improvo.config import to_dict
 from improvo.errors import ConfigError, InputError
 from improvo.files import content_hash, write_json, write_text
-from improvo.odometry.run import RunSummary
+from improvo.odometry.run.run_odometry import RunSummary
 from improvo.self_calibration.from_motion import CameraFromMotion, Told, camera_from_motion
 from improvo.self_calibration.settings import SelfCalibrationSettings
 from improvo.sequences.base import SequenceSettings

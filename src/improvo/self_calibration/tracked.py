@@ -9,8 +9,8 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
+from improvo.odometry.result.final_view import FinalView
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.view import FinalView
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.self_calibration.adjustment import Scene
 from improvo.self_calibration.lens import Lens

@@ -11,22 +11,22 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files import load_calibration, parse_yaml
 from improvo.geometry.se3 import inverse
 from improvo.geometry.text_files import read_text
 from improvo.geometry.trajectory_files import clean_poses, increasing_order, read_trajectory_report
-from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.base import SequenceSettings
+from improvo.sequences.image_files import ImageFiles, ImageFilesRecording
 from improvo.sequences.images import list_images, listed_file
-from improvo.types import Float64, Trajectory, UInt8
+from improvo.types import Float64, Trajectory
+from improvo.untrusted.numbers import numbers
 
 _TRUTH = ("state_groundtruth_estimate0", "vicon0", "mocap0")
 
 
-class EurocMav(Recording):
+class EurocMav(ImageFilesRecording):
     """A folder with `mav0`, the `mav0` folder itself, or one of its camera folders."""
 
     format = "euroc"
@@ -74,15 +74,6 @@ class EurocMav(Recording):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         return path.is_dir() and _mav_folder(path) is not None
-
-    def source(self, index: int) -> str:
-        return str(self._images.files[index])
-
-    def image(self, index: int) -> UInt8:
-        return self._images.read(index)
-
-    def present(self) -> NDArray[np.bool_]:
-        return self._images.present()
 
 
 def _mav_folder(path: Path) -> Path | None:
@@ -142,11 +133,7 @@ def _body_from_chain(path: Path, camera: str) -> Float64:
 
 
 def _rigid(values: object, path: Path, name: str) -> Float64:
-    try:
-        matrix = np.array(values, np.float64).reshape(1, 4, 4)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.full((1, 4, 4), np.nan)
-    pose = clean_poses(matrix)[0][0]
+    pose = clean_poses(numbers(values, 16).reshape(1, 4, 4))[0][0]
     if not np.isfinite(pose).all():
         raise InputError(f"{path}: {name} is no rigid 4x4 motion; repair it")
     return pose

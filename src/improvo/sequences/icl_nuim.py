@@ -15,17 +15,16 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, folder_calibration
 from improvo.geometry.text_files import read_text
 from improvo.geometry.trajectory_files import read_trajectory_report
-from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.base import SequenceSettings
+from improvo.sequences.image_files import ImageFiles, ImageFilesRecording
 from improvo.sequences.images import list_images, listed_file, read_depth
 from improvo.sequences.rates import depth_scale
-from improvo.types import Float32, Trajectory, UInt8
+from improvo.types import Float32, Trajectory
 from improvo.untrusted.names import number_of
 
 DEPTH_SCALE = 5000.0
@@ -34,7 +33,7 @@ _HEADER = 20  # lines of comments before the first pose, at most
 _UP_TO_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
-class IclNuim(Recording):
+class IclNuim(ImageFilesRecording):
     """A folder with `rgb`, `depth` and a `*.gt.freiburg` file, which may be named `groundtruth.txt`."""
 
     format = "icl"
@@ -63,15 +62,6 @@ class IclNuim(Recording):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         return path.is_dir() and (path / "rgb").is_dir() and (any(path.glob("*.gt.freiburg")) or _is_renamed(path))
-
-    def source(self, index: int) -> str:
-        return str(self._images.files[index])
-
-    def image(self, index: int) -> UInt8:
-        return self._images.read(index)
-
-    def present(self) -> NDArray[np.bool_]:
-        return self._images.present()
 
     def depth(self, index: int) -> Float32 | None:
         file = self._depth[index]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from improvo.errors import InputError
-from improvo.sequences.base import UnreadableFrameError
+from improvo.sequences.base import Recording, UnreadableFrameError
 from improvo.sequences.grey_levels import SAMPLES, Stretch, stretch_of, to_8_bits
 from improvo.sequences.images import decode, file_bytes, is_file
 from improvo.types import UInt8
@@ -89,6 +89,21 @@ class ImageFiles:
             if pictures[-1].dtype == np.uint8:
                 return None
         return stretch_of(pictures)
+
+
+class ImageFilesRecording(Recording):
+    """A recording with a file for each picture; its constructor sets `_images`."""
+
+    _images: ImageFiles
+
+    def source(self, index: int) -> str:
+        return str(self._images.files[index])
+
+    def image(self, index: int) -> UInt8:
+        return self._images.read(index)
+
+    def present(self) -> NDArray[np.bool_]:
+        return self._images.present()
 
 
 def orientation(path: Path) -> int:

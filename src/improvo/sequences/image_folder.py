@@ -16,18 +16,18 @@ from improvo.errors import InputError
 from improvo.geometry.camera_files import folder_calibration
 from improvo.geometry.time_units import in_seconds, unit_of
 from improvo.geometry.trajectory_files import has_times, increasing_order, read_times, read_trajectory_report
-from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.base import SequenceSettings
+from improvo.sequences.image_files import ImageFiles, ImageFilesRecording
 from improvo.sequences.image_kinds import one_kind
 from improvo.sequences.images import list_images
 from improvo.sequences.rates import frame_rate
-from improvo.types import Float64, Trajectory, UInt8
+from improvo.types import Float64, Trajectory
 
 _CALENDAR = re.compile(r"20\d\d(0[1-9]|1[0-2])([0-2]\d|3[01])([01]\d|2[0-3])[0-5]\d")  # 202609011230...: no count
 _SUBFOLDERS = ("images", "image", "rgb", "color", "colour", "frames", "imgs", "left", "cam0")
 
 
-class ImageFolder(Recording):
+class ImageFolder(ImageFilesRecording):
     """Images in the folder itself or in its `images` (`rgb`, `color`, ...) folder."""
 
     format = "images"
@@ -75,12 +75,6 @@ class ImageFolder(Recording):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         return _image_folder(path) is not None
-
-    def source(self, index: int) -> str:
-        return str(self._images.files[index])
-
-    def image(self, index: int) -> UInt8:
-        return self._images.read(index)
 
 
 def _image_folder(path: Path) -> Path | None:

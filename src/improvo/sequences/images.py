@@ -69,6 +69,16 @@ def depth_in_metres(values: np.ndarray, scale: float) -> Float32:
     return metres
 
 
+def depth_of_size(depth: Float32, size: tuple[int, int] | None) -> Float32:
+    """Depth (h, w) of a view as depth (H, W) of the same view in `size` (W, H): each pixel looks up the nearest.
+
+    It stays as it is where that is its size, or where that is None.
+    """
+    if size is None or depth.shape == (size[1], size[0]):
+        return depth
+    return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
+
+
 def decode(data: bytes, flags: int) -> np.ndarray:
     """An encoded image. What follows its end (the video of a motion photo, say) is left out.
 

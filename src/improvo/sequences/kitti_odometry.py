@@ -18,16 +18,16 @@ from improvo.geometry.camera_files import Calibration, folder_calibration
 from improvo.geometry.se3 import inverse, rigid
 from improvo.geometry.text_files import read_text
 from improvo.geometry.trajectory_files import increasing_order, read_times, read_trajectory_report
-from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.base import SequenceSettings
+from improvo.sequences.image_files import ImageFiles, ImageFilesRecording
 from improvo.sequences.images import list_images
-from improvo.types import Float64, Trajectory, UInt8
+from improvo.types import Float64, Trajectory
 
 FPS = 10.0
 _CAMERAS = {"image_0": 0, "image_2": 2, "image_1": 1, "image_3": 3, "image_l": 0, "image_r": 1}  # folder: number
 
 
-class KittiOdometry(Recording):
+class KittiOdometry(ImageFilesRecording):
     """A folder with `calib.txt` and `image_0` or `image_2`."""
 
     format = "kitti"
@@ -77,12 +77,6 @@ class KittiOdometry(Recording):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         return (path / "calib.txt").is_file() and any(_has_images(path / name) for name in _CAMERAS)
-
-    def source(self, index: int) -> str:
-        return str(self._images.files[index])
-
-    def image(self, index: int) -> UInt8:
-        return self._images.read(index)
 
 
 def _has_images(folder: Path) -> bool:

@@ -16,10 +16,10 @@ from improvo.geometry.camera_files import Calibration, folder_calibration, load_
 from improvo.geometry.se3 import inverse, rigid, so3_exp
 from improvo.geometry.text_files import read_text
 from improvo.geometry.trajectory_files import clean_poses, increasing_order, read_times
-from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.base import SequenceSettings
+from improvo.sequences.image_files import ImageFiles, ImageFilesRecording
 from improvo.sequences.images import list_images
-from improvo.types import Float64, Trajectory, UInt8
+from improvo.types import Float64, Trajectory
 from improvo.untrusted.names import number_of
 
 FPS = 10.0
@@ -27,7 +27,7 @@ EARTH_RADIUS = 6378137.0  # metres
 _CAMERAS = ("image_02", "image_00", "image_03", "image_01")  # the left colour camera first, then the left grey one
 
 
-class KittiRaw(Recording):
+class KittiRaw(ImageFilesRecording):
     """The folder of one drive; `--topic image_00` chooses another camera."""
 
     format = "kitti-raw"
@@ -64,12 +64,6 @@ class KittiRaw(Recording):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         return path.is_dir() and any(_is_camera(path / name) for name in _CAMERAS)
-
-    def source(self, index: int) -> str:
-        return str(self._images.files[index])
-
-    def image(self, index: int) -> UInt8:
-        return self._images.read(index)
 
 
 def _is_camera(folder: Path) -> bool:

@@ -11,19 +11,18 @@ import math
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, camera_of
-from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
-from improvo.sequences.image_files import ImageFiles
-from improvo.sequences.images import listed_file, natural_key, read_depth
+from improvo.sequences.base import SequenceSettings, UnreadableFrameError
+from improvo.sequences.image_files import ImageFiles, ImageFilesRecording
+from improvo.sequences.images import depth_of_size, listed_file, natural_key, read_depth
 from improvo.sequences.rates import frame_rate
-from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
-from improvo.types import Float32, Float64, UInt8
+from improvo.sequences.varying_camera import median_calibration, read_json, trajectory_from_opengl
+from improvo.types import Float32, Float64
 from improvo.untrusted.limits import MAX_PIXELS
+from improvo.untrusted.numbers import numbers
 
 _NAMES = ("transforms.json", "transforms_train.json")
 _NO_LENS = {
@@ -34,7 +33,7 @@ _NO_LENS = {
 }
 
 
-class Nerfstudio(Recording):
+class Nerfstudio(ImageFilesRecording):
     """A folder with `transforms.json`, or that file."""
 
     format = "nerfstudio"
@@ -70,24 +69,11 @@ class Nerfstudio(Recording):
     def recognises(cls, path: Path) -> bool:
         return path.name in _NAMES or any((path / name).is_file() for name in _NAMES)
 
-    def source(self, index: int) -> str:
-        return str(self._images.files[index])
-
-    def image(self, index: int) -> UInt8:
-        return self._images.read(index)
-
-    def present(self) -> NDArray[np.bool_]:
-        return self._images.present()
-
     def depth(self, index: int) -> Float32 | None:
         name = self._depth[index]
         if not name:
             return None
-        depth = read_depth(listed_file(self._folder, str(name)), self._scale)
-        size = self._size
-        if size is not None and depth.shape != (size[1], size[0]):
-            return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
-        return depth
+        return depth_of_size(read_depth(listed_file(self._folder, str(name)), self._scale), self._size)
 
 
 def _file(folder: Path, name: str) -> Path:

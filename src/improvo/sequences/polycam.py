@@ -7,23 +7,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from improvo.errors import InputError
 from improvo.geometry.trajectory_files import increasing_order
-from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_files import ImageFiles
-from improvo.sequences.images import list_images, read_depth
-from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
-from improvo.types import Float32, UInt8
+from improvo.sequences.base import SequenceSettings
+from improvo.sequences.image_files import ImageFiles, ImageFilesRecording
+from improvo.sequences.images import depth_of_size, list_images, read_depth
+from improvo.sequences.varying_camera import median_calibration, read_json, trajectory_from_opengl
+from improvo.types import Float32
+from improvo.untrusted.numbers import numbers
 
 DEPTH_SCALE = 1000.0
 FPS = 10.0
 _POSE = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
 
 
-class Polycam(Recording):
+class Polycam(ImageFilesRecording):
     """The export's folder, or its `keyframes`."""
 
     format = "polycam"
@@ -73,19 +73,7 @@ class Polycam(Recording):
             (folder / "cameras").is_dir() and (folder / "images").is_dir() for folder in (path / "keyframes", path)
         )
 
-    def source(self, index: int) -> str:
-        return str(self._images.files[index])
-
-    def image(self, index: int) -> UInt8:
-        return self._images.read(index)
-
     def depth(self, index: int) -> Float32 | None:
         """The depth image shows the same view at a lower resolution; each pixel looks up the nearest."""
         file = self._depth[index]
-        if not file.is_file():
-            return None
-        depth = read_depth(file, DEPTH_SCALE)
-        size = self._size
-        if size is not None and depth.shape != (size[1], size[0]):
-            return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
-        return depth
+        return depth_of_size(read_depth(file, DEPTH_SCALE), self._size) if file.is_file() else None

@@ -16,11 +16,12 @@ import numpy as np
 from improvo.errors import InputError, installed
 from improvo.geometry.se3 import rigid, rotation_from_quat_xyzw
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
-from improvo.sequences.images import decode, depth_in_metres, natural_key
-from improvo.sequences.varying_camera import median_calibration, numbers, read_json, trajectory_from_opengl
+from improvo.sequences.images import decode, depth_in_metres, depth_of_size, natural_key
+from improvo.sequences.varying_camera import median_calibration, read_json, trajectory_from_opengl
 from improvo.types import Float32, Float64, UInt8
 from improvo.untrusted.arrays import FAULTS
 from improvo.untrusted.limits import MAX_ARRAY_BYTES, MAX_JSON_BYTES, MAX_PIXELS
+from improvo.untrusted.numbers import numbers
 from improvo.untrusted.paths import check_is_file
 from improvo.untrusted.text import reason
 
@@ -96,8 +97,7 @@ class Record3d(Recording):
         if len(data) != 4 * width * height:
             raise UnreadableFrameError(f"has {len(data)} bytes of depth, not {4 * width * height}")
         depth = depth_in_metres(np.frombuffer(data, "<f4").reshape(height, width), 1.0)
-        size = self._size
-        return depth if size is None else np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
+        return depth_of_size(depth, self._size)
 
     def _depth_name(self, index: int, ending: str) -> str:
         return str(Path(self._images[index]).with_suffix(ending).as_posix())

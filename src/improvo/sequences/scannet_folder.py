@@ -16,20 +16,21 @@ from improvo.geometry.camera_files import Calibration, folder_calibration
 from improvo.geometry.camera_files.calibration import checked
 from improvo.geometry.text_files import decoded, read_text
 from improvo.geometry.trajectory_files import clean_poses
-from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.base import SequenceSettings
+from improvo.sequences.image_files import ImageFiles, ImageFilesRecording
 from improvo.sequences.images import list_images, read_depth
 from improvo.sequences.rates import frame_rate
 from improvo.sequences.registration import intrinsics_of, register_depth, relative_extrinsics
-from improvo.types import Float32, Float64, Trajectory, UInt8
+from improvo.types import Float32, Float64, Trajectory
 from improvo.untrusted.names import number_of
+from improvo.untrusted.numbers import numbers
 from improvo.untrusted.paths import check_is_file
 
 DEPTH_SCALE = 1000.0
 FPS = 30.0
 
 
-class ScanNetFolder(Recording):
+class ScanNetFolder(ImageFilesRecording):
     """An exported scene."""
 
     format = "scannet"
@@ -83,12 +84,6 @@ class ScanNetFolder(Recording):
         exported = (path / "color").is_dir() and ((path / "intrinsic").is_dir() or (path / "pose").is_dir())
         return exported or _info_file(path) is not None
 
-    def source(self, index: int) -> str:
-        return str(self._images.files[index])
-
-    def image(self, index: int) -> UInt8:
-        return self._images.read(index)
-
     def depth(self, index: int) -> Float32 | None:
         file = self._depth[index]
         if file is None or not file.is_file():
@@ -117,7 +112,7 @@ class ScanNetFolder(Recording):
         """`name = values` lines, as the C++ exporter writes them."""
         lines = read_text(info, "a description of a scene").splitlines()
         values = {name.strip(): text.split() for name, _, text in (line.partition("=") for line in lines)}
-        colour = _matrix(values.get("m_calibrationColorIntrinsic"))
+        colour = numbers(values.get("m_calibrationColorIntrinsic"), 16).reshape(4, 4)
         width, height = (_number(values.get(f"m_color{side}"), 0) for side in ("Width", "Height"))
         size = (int(width), int(height)) if width >= 1 and height >= 1 else None
 
@@ -127,10 +122,12 @@ class ScanNetFolder(Recording):
             return checked(Calibration(str(info), intrinsics_of(colour), size=size))
 
         self.calibration = self.own_calibration(published)
-        depth = _matrix(values.get("m_calibrationDepthIntrinsic"))
+        depth = numbers(values.get("m_calibrationDepthIntrinsic"), 16).reshape(4, 4)
         if np.isfinite(depth).all() and min(depth[0, 0], depth[1, 1]) > 0:
             self._depth_intrinsics = intrinsics_of(depth)
-        extrinsics = [_matrix(values.get(f"m_calibration{name}Extrinsic")) for name in ("Color", "Depth")]
+        extrinsics = [
+            numbers(values.get(f"m_calibration{name}Extrinsic"), 16).reshape(4, 4) for name in ("Color", "Depth")
+        ]
         self._extrinsics = relative_extrinsics(*extrinsics)
         scale = _number(values.get("m_depthShift"), DEPTH_SCALE)
         self._scale = scale if scale > 0 else DEPTH_SCALE
@@ -139,16 +136,10 @@ class ScanNetFolder(Recording):
 def read_matrix(path: Path) -> Float64:
     """(4, 4) from a text file, NaN if there is none or it holds anything else."""
     try:
-        return _matrix(decoded(check_is_file(path).read_bytes()).replace(",", " ").split())
+        fields = decoded(check_is_file(path).read_bytes()).replace(",", " ").split()
     except (OSError, UnicodeDecodeError):
-        return np.full((4, 4), np.nan)
-
-
-def _matrix(fields: list[str] | None) -> Float64:
-    try:
-        return np.array(fields, np.float64).reshape(4, 4)
-    except (TypeError, ValueError):
-        return np.full((4, 4), np.nan)
+        fields = []
+    return numbers(fields, 16).reshape(4, 4)
 
 
 def _number(fields: list[str] | None, default: float) -> float:

@@ -83,7 +83,13 @@ class Sequence:
         error = self.recording.calibration_error
         given = "--camera" if self.settings.camera is not None else "--fov"
         left_out = () if error is None else (f"its own calibration is left out for {given} ({_first_part(error)})",)
-        return (*self.recording.notes, *left_out)
+        return (*self.recording.notes, *self.absent, *left_out)
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """A note on pictures that the recording lists and that are not there; empty where all are."""
+        there, listed = len(self.present), len(self.indices)
+        return (f"{self.path}: {there} of {listed} listed pictures are there",) if there < listed else ()
 
     @property
     def skipped(self) -> list[SkippedFrame]:

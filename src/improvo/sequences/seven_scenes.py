@@ -15,19 +15,19 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, folder_calibration
 from improvo.geometry.trajectory_files import clean_poses
-from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.base import SequenceSettings
+from improvo.sequences.image_files import ImageFiles, ImageFilesRecording
 from improvo.sequences.images import IMAGE_SUFFIXES, read_depth
 from improvo.sequences.rates import depth_scale, frame_rate
 from improvo.sequences.scannet_folder import read_matrix
-from improvo.types import Float32, Trajectory, UInt8
+from improvo.types import Float32, Trajectory
 
 DEPTH_SCALE = 1000.0
 FPS = 30.0
 _COLOUR = re.compile(r"frame-(\d{1,9})\.color\.(\w+)")
 
 
-class SevenScenes(Recording):
+class SevenScenes(ImageFilesRecording):
     """A folder of `frame-NNNNNN.color.*` files."""
 
     format = "7scenes"
@@ -57,12 +57,6 @@ class SevenScenes(Recording):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         return path.is_dir() and next(_colour_files(path), None) is not None
-
-    def source(self, index: int) -> str:
-        return str(self._images.files[index])
-
-    def image(self, index: int) -> UInt8:
-        return self._images.read(index)
 
     def depth(self, index: int) -> Float32 | None:
         file = self._beside(index, "depth.png")

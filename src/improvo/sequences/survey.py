@@ -82,7 +82,7 @@ def survey(
         "ground_truth": _truth(sequence, problems),
         **measured,
         "unreadable": [skip.source for skip in sequence.skipped],
-        "notes": list(sequence.notes if calibrated else recording.notes),
+        "notes": list(sequence.notes if calibrated else (*recording.notes, *sequence.absent)),
     }
     problems += camera_problems(sequence) if calibrated else []
     problems += picture_problems(facts)

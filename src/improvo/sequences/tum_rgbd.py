@@ -10,7 +10,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration, folder_calibration
@@ -18,11 +17,11 @@ from improvo.geometry.text_files import read_text
 from improvo.geometry.time_units import in_seconds, note_of
 from improvo.geometry.trajectory_files import increasing_order, read_trajectory_report
 from improvo.sequences.association import nearest
-from improvo.sequences.base import Recording, SequenceSettings
-from improvo.sequences.image_files import ImageFiles
+from improvo.sequences.base import SequenceSettings
+from improvo.sequences.image_files import ImageFiles, ImageFilesRecording
 from improvo.sequences.images import listed_file, read_depth
 from improvo.sequences.rates import depth_scale
-from improvo.types import Float32, Float64, UInt8
+from improvo.types import Float32, Float64
 
 DEPTH_SCALE = 5000.0
 _DECIMAL_COMMA = re.compile(r"^(\s*\d+),(\d+)(?=[\s;]+\S)")  # of a time stamp before a separated file name
@@ -33,7 +32,7 @@ _PUBLISHED = {  # the data set's page, "Intrinsic Camera Calibration of the Kine
 }
 
 
-class TumRgbd(Recording):
+class TumRgbd(ImageFilesRecording):
     """A folder with `rgb.txt`, or with the `associations.txt` that other tools make of both lists."""
 
     format = "tum"
@@ -64,15 +63,6 @@ class TumRgbd(Recording):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         return (path / "rgb.txt").is_file() or (path.is_dir() and _pairs_file(path) is not None)
-
-    def source(self, index: int) -> str:
-        return str(self._images.files[index])
-
-    def image(self, index: int) -> UInt8:
-        return self._images.read(index)
-
-    def present(self) -> NDArray[np.bool_]:
-        return self._images.present()
 
     def depth(self, index: int) -> Float32 | None:
         row = self._depth_row[index]

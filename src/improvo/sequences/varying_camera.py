@@ -81,12 +81,3 @@ def read_json(path: Path, data: bytes | None = None) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds no JSON object; export it again")
     return content
-
-
-def numbers(values: Any, count: int) -> Float64:
-    """(count,) float64, NaN where `values` is anything else."""
-    try:
-        result = np.array(values, np.float64).ravel()
-    except (TypeError, ValueError, OverflowError, RecursionError):
-        return np.full(count, np.nan)
-    return result if len(result) == count else np.full(count, np.nan)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from improvo.errors import ConfigError, imported
+from improvo.geometry.alignment import path_lengths
 from improvo.geometry.se3 import rigid, so3_exp
 from improvo.simulation.room import Floor
 from improvo.simulation.settings import SimulationSettings
@@ -58,7 +59,7 @@ def floor_path(rng: np.random.Generator, floor: Floor, clearance: float, speed: 
     if least[best] < 0.08:
         raise ConfigError("the room is too full for a path; use fewer pieces of `furniture` or a larger `room_size`")
     dense = loops[best][:: -1 if rng.uniform() < 0.5 else 1].copy()
-    steps = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(dense, axis=0), axis=1))])
+    steps = path_lengths(dense)
     dense[-1] = dense[0]
     spline = interpolate.CubicSpline(steps, dense, bc_type="periodic")
     return FloorPath(spline, float(steps[-1]), speed, float(rng.uniform(0, steps[-1])))

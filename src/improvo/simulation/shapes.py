@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from improvo.geometry.alignment import path_lengths
 from improvo.types import Float64, Int64
 
 
@@ -52,7 +53,7 @@ def lathe(profile: list[tuple[float, float]], tile: float | None = None, slices:
     """
     points = np.asarray(profile, np.float64)
     angles = np.linspace(0, 2 * np.pi, slices + 1)
-    lengths = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    lengths = path_lengths(points)
     around = 2 * np.pi * points[:, 0].max()
     parts = []
     for row in range(len(points) - 1):

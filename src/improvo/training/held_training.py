@@ -13,7 +13,7 @@ import torch
 from improvo.errors import InputError
 from improvo.frontend.channel_pruning import without_dead_channels
 from improvo.frontend.superpoint import SuperPoint
-from improvo.frontend.weights import DataSource, Weights, load_weights
+from improvo.frontend.weights_files import DataSource, Weights, load_weights
 from improvo.training.batches.device_pairs import DevicePairs
 from improvo.training.batches.elsewhere import BUNDLED_SOURCE, HeldElsewhere, bundled_pictures
 from improvo.training.batches.teacher import network_teacher

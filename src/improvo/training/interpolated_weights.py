@@ -15,7 +15,7 @@ import numpy as np
 from improvo import files
 from improvo.errors import InputError
 from improvo.frontend.channel_pruning import with_dead_channels, without_dead_channels
-from improvo.frontend.weights import Weights, load_weights, save_weights
+from improvo.frontend.weights_files import Weights, load_weights, save_weights
 
 
 def interpolated(start: Weights, trained: Weights, share: float) -> Weights:

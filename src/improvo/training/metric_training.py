@@ -16,7 +16,7 @@ from improvo.continuation import SettingsRecord
 from improvo.frontend.architecture import CELL
 from improvo.frontend.network import NetworkFrontend
 from improvo.frontend.settings import NetworkSettings
-from improvo.frontend.weights import DataSource, load_weights, save_weights
+from improvo.frontend.weights_files import DataSource, load_weights, save_weights
 from improvo.training.augmentation.photometric import augment
 from improvo.training.augmentation.views import inside, random_view, warp_image, warp_points
 from improvo.training.batches.posed_frames import PosedFrames

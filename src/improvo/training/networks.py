@@ -12,7 +12,7 @@ from improvo.errors import ConfigError
 from improvo.frontend.architecture import ARCHITECTURES, Architecture
 from improvo.frontend.channel_pruning import without_dead_channels
 from improvo.frontend.superpoint import SuperPoint
-from improvo.frontend.weights import Weights, load_weights
+from improvo.frontend.weights_files import Weights, load_weights
 from improvo.training.widen import widen
 
 STEM_LAYERS = 4  # of the encoder, at full and half resolution

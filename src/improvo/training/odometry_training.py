@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from improvo.continuation import SettingsRecord
 from improvo.errors import InputError
 from improvo.frontend.channel_pruning import without_dead_channels
-from improvo.frontend.weights import DataSource, load_weights
+from improvo.frontend.weights_files import DataSource, load_weights
 from improvo.training.batches.homography_pairs import PairBatches
 from improvo.training.data.pictures import load_pictures
 from improvo.training.networks import started_network

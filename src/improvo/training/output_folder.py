@@ -17,7 +17,7 @@ from improvo.continuation import SettingsRecord
 from improvo.folder_lock import locked
 from improvo.frontend.architecture import Architecture
 from improvo.frontend.channel_pruning import with_dead_channels
-from improvo.frontend.weights import DataSource, ModelCard, load_weights, save_weights
+from improvo.frontend.weights_files import DataSource, ModelCard, load_weights, save_weights
 from improvo.training.distributed import Process
 from improvo.training.held_settings import HeldSettings
 from improvo.training.metrics import METRICS, read_metrics

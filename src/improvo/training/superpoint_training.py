@@ -9,7 +9,7 @@ from typing import Any
 
 from improvo.errors import InputError
 from improvo.frontend.runtime_torch import load_network
-from improvo.frontend.weights import DataSource, load_weights
+from improvo.frontend.weights_files import DataSource, load_weights
 from improvo.training.batches.drawn_shapes import ShapeBatches, shape_source
 from improvo.training.batches.homography_pairs import PairBatches
 from improvo.training.data.homographic_adaptation import Detector, adapt, network_detector, shi_tomasi

@@ -12,7 +12,7 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.frontend.architecture import Architecture
-from improvo.frontend.weights import expected_shapes
+from improvo.frontend.weights_files import expected_shapes
 from improvo.types import Float32
 
 

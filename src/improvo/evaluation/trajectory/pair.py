@@ -8,7 +8,8 @@ from pathlib import Path
 from improvo.errors import InputError
 from improvo.evaluation.truth.reference import lacks_times
 from improvo.geometry.trajectory_files import has_times, read_trajectory_report
-from improvo.odometry.run_folder import RunFolder, why_no_pose
+from improvo.odometry.run.run_folder import RunFolder
+from improvo.odometry.run.run_json import why_no_pose
 from improvo.sequences.base import SequenceSettings
 from improvo.sequences.opening import true_trajectory
 from improvo.types import Trajectory
@@ -28,7 +29,7 @@ def read_pair(
     estimate: Trajectory | Path,
     truth: Trajectory | Path,
     sequence: SequenceSettings | None = None,
-    reference: str | None = None,
+    reference: Path | str | None = None,
 ) -> tuple[Trajectory, Trajectory, tuple[str, ...]]:
     """Both trajectories, and what was odd in their files. KITTI rows without times count the other's rows.
 
@@ -78,7 +79,7 @@ def _estimate(given: Trajectory | Path) -> _Side:
     return _Side(given, "the estimate") if isinstance(given, Trajectory) else _of_file(_trajectory_file(given))
 
 
-def _truth(given: Trajectory | Path, sequence: SequenceSettings | None, reference: str | None) -> _Side:
+def _truth(given: Trajectory | Path, sequence: SequenceSettings | None, reference: Path | str | None) -> _Side:
     if isinstance(given, Trajectory):
         return _Side(given, "the truth")
     if reference is not None:
@@ -88,7 +89,9 @@ def _truth(given: Trajectory | Path, sequence: SequenceSettings | None, referenc
         assert poses is not None
         return _Side(poses, str(given))
     if lacks_times(given):
-        raise InputError(f"{given}: has no times; give the sequence as TRUTH, and this with --truth")
+        raise InputError(
+            f"{given}: has no times; give the sequence as TRUTH, and this with --truth (Python: reference)"
+        )
     if (given / "run.json").is_file():
         return _of_run(given)
     if not given.is_dir():

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.evaluation.settings import TrajectorySettings
-from improvo.evaluation.trajectory.relative import RelativeErrors, Spread, path_lengths, relative_errors
-from improvo.geometry.alignment import Similarity, align_points
+from improvo.evaluation.trajectory.relative import RelativeErrors, Spread, relative_errors
+from improvo.geometry.alignment import Similarity, align_points, path_lengths
 from improvo.geometry.se3 import rotation_angle_deg
 from improvo.geometry.trajectory_files import clean_poses
 from improvo.sequences.association import nearest

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from improvo.geometry.alignment import path_lengths
 from improvo.geometry.se3 import inverse, rotation_angle_deg
 from improvo.types import Float64, Int64
 
@@ -45,12 +46,6 @@ class RelativeErrors:
     no_prediction_rotation_deg: float | None  # mean error of standing still, the paper's "No Prediction"
     no_prediction_translation_m: float | None
     note: str  # why there is nothing to report; empty otherwise
-
-
-def path_lengths(positions: Float64) -> Float64:
-    """Distance travelled (N,) up to each of the positions (N, 3)."""
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def window_pairs(abscissa: Float64, length: float, tolerance: float, slack: float = np.inf) -> Int64:

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from improvo.errors import InputError
-from improvo.evaluation.trajectory.relative import path_lengths
 from improvo.evaluation.truth.structure_from_motion import ReconstructedImage
-from improvo.geometry.alignment import align_points
+from improvo.geometry.alignment import align_points, path_lengths
 from improvo.geometry.depth_sampling import depth_at
 from improvo.types import Float32, Float64
 

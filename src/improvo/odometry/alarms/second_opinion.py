@@ -13,16 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from improvo.errors import InputError
 from improvo.geometry import se3
-from improvo.geometry.alignment import align_points, path_length
 from improvo.geometry.camera import Camera
 from improvo.geometry.triangulation import triangulate_tracks
-from improvo.odometry.events import EventLog
 from improvo.odometry.gates import SAME_TURN_DEG
 from improvo.odometry.mapping.initial_pair import TWO_MOTIONS, InitFailure
 from improvo.odometry.mapping.start import start_map
+from improvo.odometry.result.events import EventLog
 from improvo.odometry.settings import OdometrySettings
+from improvo.odometry.verdict.path_error import error_percent
 from improvo.odometry.view import View
 from improvo.types import Float64
 
@@ -185,13 +184,7 @@ def same_poses(former: Poses, anew: Poses, max_error: float) -> bool:
     if turned.max() > _SAME * SAME_TURN_DEG:
         return False
     centers, centers_anew = (se3.inverse(each)[:, :3, 3] for each in (a, b))
-    path = path_length(centers)
-    try:
-        aligned = align_points(centers, centers_anew, with_scale=True).apply(centers_anew)
-    except InputError:  # all on one spot
-        return False
-    off = float(np.sqrt(((aligned - centers) ** 2).sum(axis=1).mean()))
-    return off <= 0.01 * _SAME * max_error * path
+    return error_percent(centers_anew, centers) <= _SAME * max_error
 
 
 def _turns(cam_from_world: Float64) -> Float64:

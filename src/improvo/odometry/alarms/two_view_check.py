@@ -17,8 +17,8 @@ from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.geometry.epipolar import sampson_errors
 from improvo.geometry.ransac import Ransac, relative_pose
-from improvo.odometry.alarms.two_motions import holds_beside
 from improvo.odometry.gates import FEATURES, LARGE_PART, SAME_TURN_DEG, STEP_FRAMES
+from improvo.odometry.mapping.two_motions import holds_beside
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View, ransac_pairs
 from improvo.tracking.matching import match_units

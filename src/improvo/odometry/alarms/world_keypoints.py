@@ -16,7 +16,7 @@ from improvo.frontend import Frontend
 from improvo.frontend.masking import features_of, unmasked
 from improvo.types import Features, Frame, Mask
 
-AHEAD = 2  # frames that are detected before their turn (`odometry/ahead.py`); more cost memory and save no time
+AHEAD = 2  # frames detected before their turn (`odometry/run/look_ahead.py`); more cost memory and save no time
 
 
 class WorldKeypoints:

@@ -10,7 +10,8 @@ import numpy as np
 from improvo.backend.problem import BundleProblem, BundleResult
 from improvo.backend.settings import ObjectiveSettings, SolverSettings
 from improvo.backend.solver import solve
-from improvo.odometry.view import NO_POINT, PointStore, View
+from improvo.odometry.point_store import PointStore
+from improvo.odometry.view import NO_POINT, View
 from improvo.types import Float64, Int64, Mask
 
 OBJECTIVE = ObjectiveSettings(depth_weight=0.0)  # the paper's, without the regulariser, which is wrong outdoors

@@ -10,8 +10,8 @@ from improvo.geometry.camera import Camera
 from improvo.geometry.epipolar import rotation_residuals
 from improvo.geometry.ransac import Ransac, RobustHomography, homography, motions_of_homography, relative_pose
 from improvo.geometry.triangulation import triangulate_tracks
-from improvo.odometry.alarms.two_motions import has_second_motion
 from improvo.odometry.gates import MIN_PARALLAX_DEG, gate
+from improvo.odometry.mapping.two_motions import has_second_motion
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View, common_tracks, matches_of_world, ransac_pairs
 from improvo.tracking.matching import match_units

@@ -13,9 +13,10 @@ from improvo.geometry.ransac import Ransac, absolute_pose
 from improvo.geometry.triangulation import triangulate_tracks
 from improvo.odometry.gates import FEWEST, MEMORY_FRAMES, MIN_PARALLAX_DEG, gate
 from improvo.odometry.mapping.projection_search import match_by_projection
+from improvo.odometry.point_store import PointStore
 from improvo.odometry.refinement.keypoint_refinement import KeypointRefiner
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.view import NO_POINT, PointStore, View, inherit_points, ransac_rows
+from improvo.odometry.view import NO_POINT, View, inherit_points, ransac_rows
 from improvo.tracking.matching import match_units
 from improvo.types import Float32, Float64, Int64, Mask
 

@@ -16,9 +16,10 @@ import numpy as np
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.odometry.gates import MEMORY_FRAMES, gate
+from improvo.odometry.point_store import PointStore
 from improvo.odometry.refinement.anchors import Anchors
 from improvo.odometry.refinement.patch_alignment import align, cut_patches, repeated, warps_between
-from improvo.odometry.view import PointStore, View
+from improvo.odometry.view import View
 from improvo.types import Float64, Int64, UInt8
 
 _FORGET_EVERY = 10  # frames

@@ -10,8 +10,8 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.files import write_json
 from improvo.geometry.trajectory_files import write_trajectory
-from improvo.odometry.map_file import read_map, write_map
-from improvo.odometry.run import RunSummary
+from improvo.odometry.run.map_file import read_map, write_map
+from improvo.odometry.run.run_odometry import RunSummary
 from improvo.odometry.scale.estimate import ScaleEstimate
 from improvo.odometry.scale.settings import ScaleSettings
 from improvo.odometry.scale.sources import Ask

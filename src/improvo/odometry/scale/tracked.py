@@ -10,7 +10,7 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.odometry.run import RunSummary
+from improvo.odometry.run.run_odometry import RunSummary
 from improvo.sequences import Sequence
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, read_points, read_tracks
 from improvo.types import Float32, Float64, Int64, Trajectory

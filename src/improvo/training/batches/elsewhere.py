@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from improvo.frontend.superpoint import sample_descriptors
-from improvo.frontend.weights import DataSource, Weights
+from improvo.frontend.weights_files import DataSource, Weights
 from improvo.sequences.images import read_grey
 from improvo.training.batches.picture_store import PictureStore
 from improvo.training.batches.teacher import network_teacher

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from improvo.frontend.channel_pruning import without_dead_channels
 from improvo.frontend.runtime_torch import load_network
-from improvo.frontend.weights import Weights
+from improvo.frontend.weights_files import Weights
 
 
 class Teacher(Protocol):

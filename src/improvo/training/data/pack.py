@@ -15,7 +15,7 @@ import numpy as np
 
 from improvo.errors import InputError
 from improvo.files import written_atomically
-from improvo.frontend.weights import DataSource
+from improvo.frontend.weights_files import DataSource
 from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.images import decode
 from improvo.training.data.pictures import Pictures, Source

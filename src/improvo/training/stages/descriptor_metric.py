@@ -16,7 +16,7 @@ import numpy as np
 
 from improvo.config import check_seed
 from improvo.errors import ConfigError, InputError
-from improvo.frontend.weights import Weights
+from improvo.frontend.weights_files import Weights
 from improvo.training.setting_checks import Checks
 from improvo.types import Features, Float32, Float64, Int64
 

@@ -10,12 +10,13 @@ import numpy as np
 from improvo.geometry import se3
 from improvo.geometry.alignment import Similarity
 from improvo.geometry.camera import Camera
-from improvo.odometry.map_builder import MapBuilder
 from improvo.odometry.mapping.bundle_adjustment import WindowReport
-from improvo.odometry.segments import Segment, SegmentPlacement, extended
-from improvo.odometry.trajectory_builder import TrajectoryBuilder
+from improvo.odometry.result.final_view import FinalView
+from improvo.odometry.result.map_builder import MapBuilder
+from improvo.odometry.result.segments import Segment, SegmentPlacement, extended
+from improvo.odometry.result.trajectory_builder import TrajectoryBuilder
 from improvo.odometry.verdict.verdict import NOT_JUDGED, Verdict
-from improvo.odometry.view import NO_POINT, FinalView, View
+from improvo.odometry.view import NO_POINT, View
 from improvo.types import Float64, SparseMap, Trajectory
 
 _NO_POSE = np.full((4, 4), np.nan)

@@ -2,39 +2,30 @@
 
 from __future__ import annotations
 
-import platform
 import re
 import time
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-
-from improvo import __version__
-from improvo.config import to_dict
 from improvo.errors import InputError
 from improvo.files import make_output_folder, write_json
-from improvo.formats import FORMAT, FORMAT_KEY
 from improvo.frontend import Frontend
 from improvo.frontend.registry import frontend_from
-from improvo.geometry.ransac import robust_solver
 from improvo.geometry.trajectory_files import write_trajectory
 from improvo.jobs.interrupts import interrupts_wait
-from improvo.odometry.ahead import detected_ahead
-from improvo.odometry.map_file import write_map
-from improvo.odometry.point_colours import PointColours
-from improvo.odometry.recorder import TrackRecorder
+from improvo.odometry.result.final_view import FinalView
+from improvo.odometry.run.look_ahead import detected_ahead
+from improvo.odometry.run.map_file import write_map
+from improvo.odometry.run.point_colours import PointColours
+from improvo.odometry.run.run_json import run_json, unit_of
+from improvo.odometry.run.track_recorder import TrackRecorder
 from improvo.odometry.run_settings import RunSettings
-from improvo.odometry.view import FinalView
 from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
 from improvo.odometry.visualizer import NullVisualizer, Visualizer
 from improvo.sequences import Sequence
-from improvo.sequences.given_files import with_absolute_files
 from improvo.terminal import counted
 from improvo.types import Trajectory
 
@@ -60,18 +51,6 @@ class RunSummary:
     def tracked(self) -> int:
         """Frames with a pose."""
         return int(self.trajectory.valid.sum())
-
-
-def unit_of(report: dict[str, Any]) -> str:
-    """The unit of a run's lengths, in words, by its run.json: metres and from what they are known, or up to scale."""
-    return str(report["scale"]) if report.get("metric") else "up to scale"
-
-
-def metres_per_unit(report: dict[str, Any], segment: int) -> float:
-    """Metres per unit of the odometry in a segment of a run, by its run.json; 1 where the run is up to scale."""
-    known = {each["segment"]: each["metres_per_unit"] for each in (report.get("metric") or {}).get("segments", [])}
-    before = [number for number in sorted(known) if number <= segment] or sorted(known)[:1]
-    return float(known[before[-1]]) if before else 1.0
 
 
 def run_odometry(
@@ -143,7 +122,7 @@ def run_odometry(
     rgb = colours.read(sequence, processed, sparse_map.ids)
     write_map(folder / "map.ply", replace(sparse_map, rgb=rgb))
     seconds["total"] = time.perf_counter() - started
-    report = _report(sequence, settings, frontend, odometry, processed, interrupted, recorder.counts, seconds)
+    report = run_json(sequence, settings, frontend, odometry, processed, interrupted, recorder.counts, seconds)
     if complete:
         write_json(folder / "run.json", report)
     return RunSummary(folder, trajectory, report)
@@ -188,86 +167,3 @@ def _track_all(
     except KeyboardInterrupt:
         return processed, True
     return processed, False
-
-
-def _report(
-    sequence: Sequence,
-    settings: RunSettings,
-    frontend: Frontend,
-    odometry: VisualOdometry,
-    processed: list[int],
-    interrupted: bool,
-    tracks: Counter[str],
-    seconds: defaultdict[str, float],
-) -> dict[str, Any]:
-    """The content of run.json."""
-    trajectory = odometry.trajectory
-    has_pose = trajectory.valid
-    camera = sequence.camera
-    return {
-        FORMAT_KEY: FORMAT,
-        "input": {
-            "path": str(sequence.path if sequence.length is None else sequence.path.absolute()),
-            "format": sequence.format,
-            "frames": len(processed) if sequence.length is None else sequence.length,
-            "first_time": _number(trajectory.times[0] if len(trajectory) else np.nan),
-            "last_time": _number(trajectory.times[-1] if len(trajectory) else np.nan),
-            "view": sequence.view,
-            "notes": list(sequence.notes),
-            "skipped": [asdict(skipped) for skipped in sequence.skipped],
-        },
-        "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
-        "frontend": frontend.name,
-        "configuration": to_dict(_found_from_anywhere(settings)),
-        "seed": settings.odometry.seed,
-        "versions": _versions(),
-        "interrupted": interrupted,
-        "scale": "unknown: the initial median depth is 1",
-        "frames": {
-            "processed": len(processed),
-            "tracked": int(has_pose.sum()),
-            "lost": int((~has_pose).sum()),
-            "lost_frames": np.flatnonzero(~has_pose).tolist(),
-            "source_index": processed,
-        },
-        "segments": [
-            {
-                **asdict(segment),
-                "mean_error": _number(segment.mean_error),
-                "verdict": segment.verdict.report(),
-            }
-            for segment in odometry.segments
-        ],
-        "events": [asdict(event) for event in odometry.events],
-        "points": len(odometry.map),
-        "tracks": dict(tracks),
-        "seconds": {name: round(value, 3) for name, value in seconds.items()},
-        "frames_per_second": round(len(processed) / max(seconds["total"], 1e-9), 2),
-    }
-
-
-def _found_from_anywhere(settings: RunSettings) -> RunSettings:
-    """The settings with absolute paths, since pictures and pages of the run may be made from another folder."""
-    frontend = settings.frontend
-    if frontend.name.endswith(".safetensors"):
-        frontend = replace(frontend, name=str(Path(frontend.name).absolute()))
-    return replace(settings, sequence=with_absolute_files(settings.sequence), frontend=frontend)
-
-
-def _number(value: float) -> float | None:
-    """JSON has no NaN."""
-    return float(value) if np.isfinite(value) else None
-
-
-def _versions() -> dict[str, str]:
-    """Of what the numbers of a run depend on."""
-    solver = robust_solver().name
-    packages = ("numpy", "numba", *(["poselib"] if solver == "poselib" else []))
-    versions = {name: version(name) for name in packages}
-    return {
-        "improvo": __version__,
-        "python": platform.python_version(),
-        **versions,
-        "opencv": str(cv2.__version__),
-        "robust_solver": solver,
-    }

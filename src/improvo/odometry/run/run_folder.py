@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,25 +12,17 @@ from numpy.typing import NDArray
 
 from improvo import config
 from improvo.errors import InputError
-from improvo.files import check_folder_format
-from improvo.formats import FORMAT_KEY, check_format
 from improvo.geometry.camera import Camera
 from improvo.geometry.trajectory_files import read_trajectory
-from improvo.odometry.map_file import read_map
-from improvo.odometry.run import unit_of
+from improvo.odometry.run.map_file import read_map
+from improvo.odometry.run.run_json import read_run_json, unit_of
 from improvo.odometry.verdict.told_verdicts import doubtful_frames, uncertain_frames
 from improvo.sequences import Sequence, SequenceSettings, open_sequence
 from improvo.stability.rule import IGNORE
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsTable, TracksTable, read_points, read_tracks
 from improvo.types import Float64, Int64, Mask, SparseMap, Trajectory, UInt8
 from improvo.untrusted.paths import as_text, check_path
-from improvo.untrusted.text import read_json_file, reason
-
-_FORMER_KINDS = {"waiting": "initialising"}  # of events
-_MENDS = {  # by a word of the reason
-    "parallax": "the camera turned or stood still: move it sideways at the start (`improvo info` shows what it sees)",
-    "match": "`improvo info` tells whether the pictures are dark, blurred or without texture",
-}
+from improvo.untrusted.text import reason
 
 
 @dataclass(frozen=True)
@@ -64,18 +55,9 @@ class RunFolder:
         self._sequence_path = sequence_path
         if not path.is_dir():
             raise InputError(f"{path}: no such folder; give the output folder of `improvo run`")
-        try:
-            check_folder_format(path)
-            report = _with_present_names(read_json_file(path / "run.json", "run `improvo run` again"))
-            self.report: dict[str, Any] = _told_where(report, f"{path / 'run.json'}")
-            check_format(self.report.get(FORMAT_KEY), path / "run.json", "run `improvo run` again")
-            self.recorded_input = check_path(Path(self.report["input"]["path"]))
-            self.source_index: list[int] = self.report["frames"]["source_index"]
-            _check(self.report)
-        except FileNotFoundError:
-            raise InputError(f"{path}: has no run.json; give the output folder of `improvo run`") from None
-        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-            raise InputError(f"{path / 'run.json'}: cannot be read ({error}); run `improvo run` again") from None
+        self.report: dict[str, Any] = read_run_json(path)
+        self.recorded_input = Path(self.report["input"]["path"])
+        self.source_index: list[int] = self.report["frames"]["source_index"]
 
     @property
     def name(self) -> str:
@@ -241,63 +223,3 @@ class RunFolder:
             frame_index - self.birth[rows],
             self.stability_of_rows[rows],
         )
-
-
-def why_no_pose(report: dict[str, Any]) -> str | None:
-    """Why no frame of a run has a pose, and what helps, from its run.json; None where some have."""
-    if report["frames"]["tracked"]:
-        return None
-    details = [str(event["detail"]) for event in report["events"] if event["kind"] == "initialising"]
-    reason = details[-1] if details else "the run ended before a map could start"
-    mend = next((mend for word, mend in _MENDS.items() if word in reason), _MENDS["match"])
-    return f"no frame has a pose: {reason}; {mend}"
-
-
-class _Section(dict[str, Any]):
-    """A part of run.json; what it lacks is an error of the file, wherever it is asked for."""
-
-    where = ""
-
-    def __missing__(self, key: object) -> Any:
-        raise InputError(f"{self.where}: has no `{key}`; run `improvo run` again")
-
-
-def _told_where(value: Any, where: str) -> Any:
-    """The same with every dictionary a section that knows its file."""
-    if isinstance(value, list):
-        return [_told_where(item, where) if isinstance(item, dict | list) else item for item in value]
-    if not isinstance(value, dict):
-        return value
-    section = _Section({key: _told_where(item, where) for key, item in value.items()})
-    section.where = where
-    return section
-
-
-def _check(report: dict[str, Any]) -> None:
-    """Refuse a run.json that is not as `improvo run` writes it.
-
-    Raises:
-        ValueError, KeyError, TypeError: it is not.
-    """
-    frames, indices = report["frames"], report["frames"]["source_index"]
-    lists = [indices, frames["lost_frames"], [frames["tracked"]]]
-    if not all(isinstance(row, list) and all(type(number) is int for number in row) for row in lists):
-        raise ValueError("its frames are no numbers")
-    if any(b <= a for a, b in pairwise(indices)) or not all(0 <= number < 1 << 40 for number in indices):
-        raise ValueError("its frames are out of order")
-    if not all(isinstance(report.get(name, {}), dict) for name in ("camera", "configuration")):
-        raise ValueError("its camera or configuration has no names")
-    for event in report["events"]:
-        if not isinstance(event["kind"], str):
-            raise ValueError("an event is of no kind")
-
-
-def _with_present_names(report: dict[str, Any]) -> dict[str, Any]:
-    """The content of run.json, also of one that was written when events and settings had other names."""
-    events = [
-        {("frame_index" if key == "position" else key): value for key, value in event.items()}
-        for event in report.get("events", [])
-    ]
-    for event in events:
-        event["kind"] = _FORMER_KINDS.get(event["kind"], event["kind"])
-    return {**report, "events": events, "configuration": config.with_present_names(report.get("configuration", {}))}

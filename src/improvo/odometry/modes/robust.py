@@ -7,9 +7,7 @@ from improvo.odometry.alarms.attached import AttachedDetector
 from improvo.odometry.alarms.focal_change import LensWatch
 from improvo.odometry.alarms.second_opinion import SecondOpinion
 from improvo.odometry.alarms.two_view_check import TwoViewCheck
-from improvo.odometry.events import EventLog
 from improvo.odometry.gates import MEMORY_FRAMES, gate
-from improvo.odometry.mapper import Mapper
 from improvo.odometry.mapping.bridging import Bridging
 from improvo.odometry.mapping.bundle_adjustment import OBJECTIVE, SOLVER, WindowReport, adjust
 from improvo.odometry.mapping.former_map import FormerMap
@@ -17,9 +15,11 @@ from improvo.odometry.mapping.initial_pair import InitFailure
 from improvo.odometry.mapping.local_map import LocalMap
 from improvo.odometry.mapping.sliding_window import SlidingWindow
 from improvo.odometry.mapping.start import start_map
-from improvo.odometry.result import OdometryResult
+from improvo.odometry.modes.mapper import Mapper
+from improvo.odometry.modes.states import StateMachine, TrackingState
+from improvo.odometry.result.events import EventLog
+from improvo.odometry.result.odometry_result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.states import StateMachine, TrackingState
 from improvo.odometry.verdict.judging import SegmentJudge
 from improvo.odometry.view import View
 from improvo.types import Float64, Mask

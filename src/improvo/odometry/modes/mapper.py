@@ -5,11 +5,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 from improvo.geometry.camera import Camera
-from improvo.odometry.events import EventLog
 from improvo.odometry.mapping.local_map import LocalMap
-from improvo.odometry.result import OdometryResult
+from improvo.odometry.modes.states import TrackingState
+from improvo.odometry.result.events import EventLog
+from improvo.odometry.result.odometry_result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.states import TrackingState
 from improvo.odometry.view import View
 from improvo.types import Mask
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
-from improvo.odometry.view import FinalView
+from improvo.odometry.result.final_view import FinalView
 from improvo.stability.rule import label_stability
 from improvo.stability.settings import LabelSettings
 from improvo.stability.tables import POINTS_FILE, TRACKS_FILE, PointsWriter, TracksWriter

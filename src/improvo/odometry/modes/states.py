@@ -9,7 +9,7 @@
 `map_ended` leads back to INITIALISING from every other state: too many frames in a row are lost, or two-view geometry
 contradicts the map. A provisional map that is contradicted is started anew over the same frames, and nothing of it was
 final; one that was confirmed ends its segment. A provisional map may be joined with that of a segment that was lost
-before (`bridging.py`), which changes its world and scale, but not the state.
+before (`mapping/bridging.py`), which changes its world and scale, but not the state.
 """
 
 from __future__ import annotations

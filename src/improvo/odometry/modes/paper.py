@@ -13,14 +13,14 @@ from improvo.backend.settings import SolverSettings
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.odometry.alarms.two_view_check import TwoViewCheck
-from improvo.odometry.events import EventLog
 from improvo.odometry.gates import FEWEST
-from improvo.odometry.mapper import Mapper
 from improvo.odometry.mapping.bundle_adjustment import adjust
 from improvo.odometry.mapping.local_map import LocalMap
-from improvo.odometry.result import OdometryResult
+from improvo.odometry.modes.mapper import Mapper
+from improvo.odometry.modes.states import TrackingState
+from improvo.odometry.result.events import EventLog
+from improvo.odometry.result.odometry_result import OdometryResult
 from improvo.odometry.settings import OdometrySettings
-from improvo.odometry.states import TrackingState
 from improvo.odometry.view import NO_POINT, View, inherit_points
 from improvo.types import Float64
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from improvo.odometry.mapping.bridging import Join
-from improvo.odometry.segments import Segment
+from improvo.odometry.result.segments import Segment
 from improvo.odometry.verdict.verdict import DOUBTFUL, NOT_JUDGED, RIGHT, Verdict
 
 _WORTH_SAYING = 0.03  # share of the keypoints

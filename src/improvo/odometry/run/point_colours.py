@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from improvo.errors import InputError
-from improvo.odometry.view import FinalView
+from improvo.odometry.result.final_view import FinalView
 from improvo.sequences import Sequence
 from improvo.types import Float32, Int64, UInt8
 
