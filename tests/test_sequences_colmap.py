@@ -60,17 +60,31 @@ def test_what_lies_beside_the_images_comes_before_the_model(project: Path) -> No
     np.testing.assert_allclose(sequence.ground_truth.camera_centers[:, 0], np.arange(COUNT), atol=1e-9)
 
 
-@pytest.mark.parametrize("damage", ["two cameras", "cut short"])
-def test_a_model_that_cannot_be_used_leaves_a_folder_of_images(project: Path, damage: str) -> None:
+def with_second_camera(project: Path, row: str) -> Path:
+    """The fourth image has this camera."""
     model = project / "sparse" / "0"
-    if damage == "two cameras":
-        first = (model / "cameras.txt").read_text()
-        (model / "cameras.txt").write_text(
-            first + first.replace("3 PINHOLE", "4 SIMPLE_PINHOLE", 1).replace(" 91.0", "")
-        )
-        (model / "images.txt").write_text((model / "images.txt").read_text().replace(" 3 0003.png", " 4 0003.png"))
-    else:
-        (model / "images.txt").write_text("1 1 0 0\n")
+    (model / "cameras.txt").write_text(f"3 PINHOLE 96 72 90 91 47.5 37\n4 {row}\n")
+    (model / "images.txt").write_text((model / "images.txt").read_text().replace(" 3 0003.png", " 4 0003.png"))
+    return project
+
+
+def test_where_each_image_has_its_own_camera_their_median_is_taken(project: Path) -> None:
+    sequence = open_sequence(with_second_camera(project, "PINHOLE 96 72 99 91 47.5 37"))
+    assert sequence.camera == CAMERA
+    assert any("intrinsics vary by 10.0 % of the focal length" in note for note in sequence.notes)
+
+
+def test_images_of_two_kinds_of_camera_want_one_that_is_given(project: Path) -> None:
+    with_second_camera(project, "SIMPLE_RADIAL 96 72 90 47.5 37 0.1")
+    with pytest.raises(InputError, match="its images have 2 different cameras"):
+        open_sequence(project)
+    sequence = open_sequence(project, fov=60.0)
+    assert sequence.ground_truth is not None
+    assert sequence.ground_truth.valid.all()
+
+
+def test_a_damaged_model_leaves_a_folder_of_images(project: Path) -> None:
+    (project / "sparse" / "0" / "images.txt").write_text("1 1 0 0\n")
     with pytest.raises(InputError, match="has no calibration"):
         open_sequence(project)
     sequence = open_sequence(project, fov=60.0)

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from improvo.errors import InputError
+from improvo.geometry.camera_files import Calibration
 from improvo.geometry.colmap_model import ColmapModel, is_colmap_model, read_colmap_model
 from improvo.geometry.se3 import inverse
 from improvo.sequences.base import SequenceSettings
 from improvo.sequences.image_folder import ImageFolder
+from improvo.sequences.varying_camera import median_calibration
 from improvo.types import Float64, Int64, Trajectory
 
 _MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
@@ -37,7 +39,9 @@ class ColmapProject(ImageFolder):
             self.notes = (*self.notes, f"its COLMAP model is left out ({error})")
             return
         if self.calibration is None and self.calibration_error is None:
-            self.calibration = model.calibration
+            notes = list(self.notes)
+            self.calibration = self.own_calibration(lambda: _common_camera(model, notes))
+            self.notes = tuple(notes)
         if self.ground_truth is None:
             self._poses = _poses_of(model, self._images.files)
             self.ground_truth = Trajectory(self.times, self._poses)
@@ -59,6 +63,22 @@ def _model_of(path: Path) -> Path | None:
     """The folder of the model of a project, or of its `images` folder."""
     homes = (path, path.parent) if path.name == "images" else (path,)
     return next((home / name for home in homes for name in _MODELS if is_colmap_model(home / name)), None)
+
+
+def _common_camera(model: ColmapModel, notes: list[str]) -> Calibration:
+    """One camera for all images: COLMAP gives each its own unless told otherwise, and then their median is taken.
+
+    A line is added to `notes` where they differ by 1 %.
+
+    Raises:
+        InputError: they are of several sizes or kinds, and so hardly of one camera.
+    """
+    each = model.calibrations
+    if len({(one.size, one.distortion_model, len(one.distortion)) for one in each}) > 1:
+        return model.calibration  # says how many there are
+    distortion = tuple(np.median([one.distortion for one in each], axis=0).tolist())
+    rows = np.array([one.intrinsics for one in each])
+    return median_calibration(str(model.folder), rows, distortion, each[0].distortion_model, each[0].size, notes)
 
 
 def _poses_of(model: ColmapModel, files: list[Path]) -> Float64:
