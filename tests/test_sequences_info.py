@@ -70,6 +70,15 @@ def test_blur_darkness_and_missing_texture(tmp_path: Path) -> None:
     assert "black or white" in said(look(tmp_path / "clipped", clipped))
 
 
+def test_the_black_around_a_round_picture_is_no_darkness(tmp_path: Path) -> None:
+    circle = np.zeros((72, 96), np.uint8)
+    cv2.circle(circle, (48, 36), 30, 1, -1)
+    findings = look(tmp_path, [np.clip(picture, 40, 240) * circle for picture in images(12)])
+    assert findings.facts["clipped"] == 0
+    assert findings.facts["brightness"] == pytest.approx(np.median(np.clip(images(1)[0], 40, 240)), abs=10)
+    assert "dark" not in said(findings)
+
+
 def test_without_or_with_a_wrong_calibration_it_still_looks(tmp_path: Path) -> None:
     write_video(tmp_path / "v.avi", images(6))
     findings = survey(tmp_path / "v.avi", SequenceSettings())
