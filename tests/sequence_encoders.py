@@ -205,6 +205,23 @@ def write_polycam(folder: Path, scene: Scene) -> Path:
     return folder
 
 
+def write_colmap_project(folder: Path, scene: Scene, model: str = "sparse/0") -> Path:
+    """Images and a model of them as text; its pixels count from the corner, its poses are camera-from-world."""
+    (folder / "images").mkdir(parents=True)
+    (folder / model).mkdir(parents=True)
+    c = scene.camera
+    size = f"{c.width} {c.height}"
+    (folder / model / "cameras.txt").write_text(f"3 PINHOLE {size} {c.fx} {c.fy} {c.cx + 0.5} {c.cy + 0.5}\n")
+    lines = []
+    for i, (image, pose) in enumerate(zip(scene.images, np.linalg.inv(scene.poses), strict=True)):
+        (folder / "images" / f"{i:04d}.png").write_bytes(png(image))
+        x, y, z, w = quat_xyzw_from_rotation(pose[:3, :3]).tolist()
+        motion = " ".join(repr(float(value)) for value in (w, x, y, z, *pose[:3, 3]))
+        lines += [f"{i + 1} {motion} 3 {i:04d}.png", ""]
+    (folder / model / "images.txt").write_text("\n".join(lines) + "\n")
+    return folder
+
+
 def record3d_metadata(scene: Scene) -> dict[str, object]:
     c = scene.camera
     poses = scene.poses @ _CV_FROM_GL

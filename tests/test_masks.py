@@ -211,6 +211,20 @@ def test_what_never_changes_is_found(tmp_path: Path) -> None:
         still_mask(open_recording(tmp_path / "plain"), np.arange(20), 20)
 
 
+def test_a_sky_that_touches_what_is_far_away_is_no_overlay() -> None:
+    """As in a drive: the horizon stands still, trees at both sides move, and the sky touches both."""
+    still = StillPixels()
+    far, near = texture(9)[:16, :120], texture(size=640)
+    for number in range(20):
+        picture = near[:240, 8 * number : 8 * number + 320].copy()
+        picture[:104, 100 - 5 * (number % 7) : 220 + 6 * (number % 5)] = 200
+        picture[104:120, 100:220] = far
+        still.add(picture)
+    black = still.mask() == 0
+    assert black[106:118, 104:216].mean() > 0.95
+    assert black[:90].mean() == 0
+
+
 def test_info_notices_it_writes_a_mask_and_is_content_with_that(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -7,6 +7,7 @@ import pytest
 from simulated_features import CAMERA, hand_motion, nothing_to_see, observe, room, views_of
 
 from improvo.geometry import se3
+from improvo.odometry.events import EventLog
 from improvo.odometry.gates import MEMORY_FRAMES
 from improvo.odometry.mapping import local_map as local_map_module
 from improvo.odometry.mapping.local_map import LocalMap
@@ -71,6 +72,25 @@ def test_without_common_tracks_earlier_views_are_matched_by_descriptors(mapped: 
     inliers, _ = local_map.localise(far, views[19])
     assert inliers > 30
     assert turned(far, 25, views[0]) < 0.5
+
+
+def test_a_place_that_the_camera_cannot_have_come_to_is_refused_and_says_so(
+    mapped: tuple[LocalMap, list[View]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    local_map, views = mapped
+    monkeypatch.setattr(local_map_module, "_FASTER", 0.1)
+    monkeypatch.setattr(local_map_module, "_FAST", 0.0)
+    far = views[25]
+    far.tracks = far.tracks + 10**6
+    inliers, _ = local_map.localise(far, views[19])
+    assert far.cam_from_world is None
+    assert local_map.refused > 30
+    events = EventLog()
+    events.lost(25, inliers, local_map.refused)
+    assert f"{local_map.refused} points of the map found, but where the camera can" in events.events[0].detail
+    dark = views_of([nothing_to_see(3)], first=20)[0]
+    local_map.localise(dark, views[19])
+    assert local_map.refused == 0
 
 
 def test_a_view_that_shows_nothing_of_the_map_gets_no_pose(mapped: tuple[LocalMap, list[View]]) -> None:

@@ -100,6 +100,15 @@ def test_a_visualizer_is_told_of_the_end_also_after_an_error(with_a_dark_frame: 
     assert watcher.told.count("end") == 1
 
 
+def test_pictures_of_other_sizes_are_named_where_too_few_are_left(tmp_path: Path) -> None:
+    walk = write_walk(tmp_path / "walk", frames=4)
+    for number in range(1, 4):
+        file = walk / f"{number:06d}.png"
+        assert cv2.imwrite(str(file), cv2.imread(str(file))[:-number])
+    with pytest.raises(InputError, match=r"only 1 of its .*000001\.png is \d+x\d+ in a recording of .*of one size"):
+        run_odometry(open_sequence(walk), tmp_path / "out", RunSettings(frontend=FrontendSettings(name="orb")))
+
+
 def test_a_segment_in_which_nothing_was_measured_has_no_error(with_a_dark_frame: Path, tmp_path: Path) -> None:
     settings = RunSettings(frontend=ORB, odometry=OdometrySettings(mode="paper"))
     run_odometry(open_sequence(with_a_dark_frame), tmp_path / "out", settings)

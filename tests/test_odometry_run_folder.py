@@ -149,6 +149,8 @@ def test_a_run_without_poses_says_why_and_what_helps() -> None:
     assert said is not None
     assert said.startswith("no frame has a pose: too little parallax")
     assert "move it sideways" in said
+    far_apart = {"kind": "initialising", "detail": "too few tracks"}
+    assert "give all frames of the video" in str(why_no_pose({"frames": frames, "events": [far_apart]}))
     empty = why_no_pose({"frames": frames, "events": []})
     assert empty is not None
     assert empty.startswith("no frame has a pose: the run ended before a map could start; ")

@@ -44,6 +44,8 @@ WRITERS: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "sens-raw": ("sens", lambda path: encoders.write_sens(path / "s.sens", float32_scene(), "raw")),
     "scannet": ("scannet", lambda path: encoders.write_scannet_folder(path / "s", scene())),
     "nerfstudio": ("nerfstudio", lambda path: encoders.write_transforms(path / "s", scene())),
+    "colmap": ("colmap", lambda path: encoders.write_colmap_project(path / "s", scene())),
+    "colmap-undistorted": ("colmap", lambda path: encoders.write_colmap_project(path / "s", scene(), "sparse")),
     "polycam": ("polycam", lambda path: encoders.write_polycam(path / "s", scene())),
     "record3d": ("record3d", lambda path: encoders.write_r3d(path / "s.r3d", scene())),
     "ros1": ("rosbag", lambda path: ros_encoders.write_bag(path / "s.bag", scene(), 1)),
@@ -59,8 +61,8 @@ WRITERS: dict[str, tuple[str, Callable[[Path], Path]]] = {
         lambda path: ros_encoders.write_bag(path / "s", scene(), 2, latency=1234567, storage="mcap"),
     ),
 }
-WITHOUT_TIME = ("7scenes", "scannet", "nerfstudio")
-WITHOUT_DEPTH = ("images", "kitti", "euroc", "record3d")
+WITHOUT_TIME = ("7scenes", "scannet", "nerfstudio", "colmap", "colmap-undistorted")
+WITHOUT_DEPTH = ("images", "kitti", "euroc", "record3d", "colmap", "colmap-undistorted")
 WITHOUT_TRUTH = ("images",)
 
 
@@ -74,7 +76,7 @@ def test_round_trip_is_exact(tmp_path: Path, name: str) -> None:
     assert sequence.camera.is_pinhole
     np.testing.assert_allclose(sequence.camera.K, expected.camera.K, rtol=0, atol=1e-9)
     start = 0.0 if name in WITHOUT_TIME else 1000.0
-    step = {"scannet": 1 / 30, "nerfstudio": 1 / 30}.get(name, 0.25)
+    step = 1 / 30 if name in ("scannet", "nerfstudio", "colmap", "colmap-undistorted") else 0.25
     np.testing.assert_allclose(sequence.times, start + np.arange(COUNT) * step, rtol=0, atol=1e-9)
     for i, frame in enumerate(sequence):
         assert (frame.image == expected.images[i]).all()

@@ -56,7 +56,7 @@ def test_duplicates_are_counted(tmp_path: Path) -> None:
 def test_gaps_are_found(tmp_path: Path) -> None:
     findings = look(tmp_path, images(10), [i / 10 if i < 6 else i / 10 + 2.0 for i in range(10)])
     assert findings.facts["gaps"] == [{"after_frame": 5, "seconds": pytest.approx(2.1)}]
-    assert "1 gaps" in said(findings)
+    assert "1 gap in" in said(findings)
 
 
 def test_blur_darkness_and_missing_texture(tmp_path: Path) -> None:
@@ -68,6 +68,15 @@ def test_blur_darkness_and_missing_texture(tmp_path: Path) -> None:
     assert "little texture" in said(look(tmp_path / "flat", flat))
     clipped = [np.where(texture(i, 100)[:72, :96] > 128, 255, 0).astype(np.uint8) for i in range(4)]
     assert "black or white" in said(look(tmp_path / "clipped", clipped))
+
+
+def test_the_black_around_a_round_picture_is_no_darkness(tmp_path: Path) -> None:
+    circle = np.zeros((72, 96), np.uint8)
+    cv2.circle(circle, (48, 36), 30, 1, -1)
+    findings = look(tmp_path, [np.clip(picture, 40, 240) * circle for picture in images(12)])
+    assert findings.facts["clipped"] == 0
+    assert findings.facts["brightness"] == pytest.approx(np.median(np.clip(images(1)[0], 40, 240)), abs=10)
+    assert "dark" not in said(findings)
 
 
 def test_without_or_with_a_wrong_calibration_it_still_looks(tmp_path: Path) -> None:
@@ -100,6 +109,24 @@ def test_pictures_that_a_list_names_and_that_are_not_there_are_counted(tmp_path:
     assert (facts["camera"] is not None) == calibrated
     some = survey(tmp_path, SequenceSettings(end=4)).facts
     assert not some["notes"], "of the frames that are asked for"
+
+
+def test_pictures_of_another_size_are_not_taken_for_damaged_ones(tmp_path: Path) -> None:
+    pictures = images(6)
+    findings = look(tmp_path, [*pictures[:5], pictures[5][:40]])
+    assert findings.facts["unreadable_because"] == "is 96x40 in a recording of 96x72"
+    problem = next(problem for problem in findings.problems if "cannot be read" in problem.what)
+    assert problem.what.endswith("is 96x40 in a recording of 96x72")
+    assert "all pictures in one size" in problem.advice
+
+
+@pytest.mark.parametrize(
+    ("copies", "advice"), [(2, "--stride 2 leaves most of them out"), (6, "a --stride leaves most of them out, larger")]
+)
+def test_a_stride_of_two_is_advised_only_where_it_helps(tmp_path: Path, copies: int, advice: str) -> None:
+    pictures = [picture for picture in images(12 // copies) for _ in range(copies)]
+    problem = next(p for p in look(tmp_path, pictures).problems if "show the same picture" in p.what)
+    assert advice in problem.advice
 
 
 def test_command_prints_text_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,10 +20,10 @@ from improvo.errors import ConfigError, ImprovoError, InputError, OutputError
 from improvo.evaluation.homography.pairs import Scene, open_scene
 from improvo.evaluation.settings import HomographySettings
 from improvo.evaluation.stability.causes import TrueCauses
-from improvo.evaluation.truth.colmap_model import read_colmap_model
 from improvo.evaluation.truth.reference import lacks_times
 from improvo.files import check_output_folder, write_text
 from improvo.geometry.camera_files import calibration_yaml, load_calibration
+from improvo.geometry.colmap_model import read_colmap_model
 from improvo.geometry.text_files import read_text
 from improvo.geometry.trajectory_files import read_times, read_trajectory
 from improvo.odometry.run.run_folder import RunFolder

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from improvo.errors import InputError
 from improvo.geometry.camera_files import Calibration
-from improvo.types import Float32, Float64, Trajectory, UInt8
+from improvo.sequences.association import poses_at
+from improvo.types import Float32, Float64, Int64, Trajectory, UInt8
 
 
 class UnreadableFrameError(Exception):
@@ -101,6 +102,10 @@ class Recording(ABC):
     def present(self) -> NDArray[np.bool_]:
         """(N,) whether there is a picture, as far as that is known without reading it: a list may name absent files."""
         return np.ones(len(self), np.bool_)
+
+    def true_poses(self, indices: Int64) -> Trajectory | None:
+        """Ground truth of these frames (M,), NaN where there is none; None where the recording has none at all."""
+        return None if self.ground_truth is None else poses_at(self.ground_truth, self.times[indices])
 
     def depth(self, index: int) -> Float32 | None:
         """Depth in metres (H, W) registered to the raw image, NaN where missing; None where there is none."""

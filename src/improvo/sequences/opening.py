@@ -14,7 +14,6 @@ from typing import Any
 
 from improvo.errors import ConfigError, InputError
 from improvo.files import never_replace
-from improvo.sequences.association import poses_at
 from improvo.sequences.base import Recording, SequenceSettings, UnreadableFrameError
 from improvo.sequences.images import IMAGE_SUFFIXES, natural_key
 from improvo.sequences.live import LiveStream, is_live
@@ -43,6 +42,7 @@ FORMATS: dict[str, str] = {
     "kitti": "improvo.sequences.kitti_odometry:KittiOdometry",
     "kitti-raw": "improvo.sequences.kitti_raw:KittiRaw",
     "video": "improvo.sequences.video_file:VideoFile",
+    "colmap": "improvo.sequences.colmap_project:ColmapProject",
     "images": "improvo.sequences.image_folder:ImageFolder",
 }
 
@@ -75,8 +75,7 @@ def true_trajectory(path: Path | str, settings: SequenceSettings | None = None, 
     if isinstance(recording, LiveStream):
         recording.close()
         return None
-    times = recording.times[selected(recording, settings)]
-    return None if recording.ground_truth is None else poses_at(recording.ground_truth, times)
+    return recording.true_poses(selected(recording, settings))
 
 
 def open_recording(path: Path | str, settings: SequenceSettings | None = None, **overrides: Any) -> Recording:

@@ -12,7 +12,6 @@ import numpy as np
 from improvo.errors import InputError
 from improvo.geometry.camera import Camera
 from improvo.geometry.camera_files import Calibration, from_field_of_view
-from improvo.sequences.association import poses_at
 from improvo.sequences.base import Recording, SequenceSettings, SkippedFrame, UnreadableFrameError
 from improvo.sequences.images import grey
 from improvo.sequences.mask import SequenceMasks
@@ -104,8 +103,7 @@ class Sequence:
     @cached_property
     def ground_truth(self) -> Trajectory | None:
         """Camera-to-world at `times`, one row per selected frame, NaN where there is no pose; None without any."""
-        truth = self.recording.ground_truth
-        return None if truth is None else poses_at(truth, self.times)
+        return self.recording.true_poses(self.indices)
 
     @property
     def length(self) -> int | None:

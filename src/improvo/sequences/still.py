@@ -25,6 +25,7 @@ _ALIKE = 0.85  # length of the mean gradient over mean length: 1 where it never 
 _STEADY = 0.5  # deviation of the gradient's length over its mean
 _MOVING = 0.6  # `_ALIKE` of the median pixel with structure beyond which hardly anything moves
 _FLAT = 3.0  # deviation in grey levels of a pixel without structure that belongs to what stands still around it
+_FRAMED = 0.5  # of a flat area's outline that stands still; sky and asphalt in real drives and flights: up to 0.3
 _SPECK = 24  # pixels; smaller places are chance
 _GAP = 7  # pixels between parts of one overlay, such as the digits of a clock
 _MARGIN = 2  # pixels around what was found
@@ -84,7 +85,7 @@ class StillPixels:
             return np.zeros(shape, np.bool_)
         found = _without_specks(_closed(structured & (alike > _ALIKE) & (steady < _STEADY)))
         flat = np.sqrt(np.maximum(grey_squared - grey**2, 0)) < _FLAT
-        return _grown(_filled(_closed(found | _touching(flat & ~found, found))), _MARGIN) if found.any() else found
+        return _grown(_filled(_closed(found | _framed(flat & ~found, found))), _MARGIN) if found.any() else found
 
 
 def still_mask(recording: Recording, indices: Int64, samples: int) -> UInt8:
@@ -124,11 +125,23 @@ def _without_specks(mask: Mask) -> Mask:
     return np.asarray(large[labels], np.bool_)
 
 
-def _touching(mask: Mask, seeds: Mask) -> Mask:
-    """The connected parts of a mask that touch the seeds."""
-    _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
-    touched = np.unique(labels[_grown(seeds, 1)])
-    return np.asarray(np.isin(labels, touched[touched > 0]))
+def _framed(mask: Mask, frame: Mask) -> Mask:
+    """The connected parts of a mask whose outline within the picture lies mostly on the frame.
+
+    The bar of a letterbox and the inside of a clock are so. A sky or a road touches something far away that stands
+    still, too, but most of its outline moves.
+    """
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    near = _grown(frame, 1)
+    outline, framed = np.zeros(count), np.zeros(count)
+    for side in range(4):  # the neighbours to the right, below, to the left, above
+        part, beside, by_frame = (np.rot90(values, side) for values in (labels, mask, near))
+        edge = part[:, :-1][~beside[:, 1:]]
+        outline += np.bincount(edge, minlength=count)
+        framed += np.bincount(edge, by_frame[:, 1:][~beside[:, 1:]], minlength=count)
+    kept = (framed > 0) & (framed >= _FRAMED * outline)
+    kept[0] = False
+    return np.asarray(kept[labels], np.bool_)
 
 
 def _filled(mask: Mask) -> Mask:

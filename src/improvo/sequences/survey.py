@@ -17,6 +17,7 @@ from improvo.sequences.rates import given_calibration
 from improvo.sequences.sequence import Sequence
 from improvo.sequences.survey_judgement import Problem, camera_problems, picture_problems
 from improvo.sequences.survey_pictures import measure
+from improvo.terminal import counted
 
 PLACEHOLDER_FOV = 60.0
 GAP_STEPS = 2.5  # median time steps
@@ -82,6 +83,7 @@ def survey(
         "ground_truth": _truth(sequence, problems),
         **measured,
         "unreadable": [skip.source for skip in sequence.skipped],
+        "unreadable_because": sequence.skipped[0].reason if sequence.skipped else None,
         "notes": list(sequence.notes if calibrated else (*recording.notes, *sequence.absent)),
     }
     problems += camera_problems(sequence) if calibrated else []
@@ -116,7 +118,7 @@ def _timing(sequence: Sequence, problems: list[Problem]) -> dict[str, Any]:
         longest = max(gaps, key=lambda gap: float(gap["seconds"]))
         problems.append(
             Problem(
-                f"{len(gaps)} gaps in the time stamps, the longest {longest['seconds']:.3g} s after frame "
+                f"{counted(len(gaps), 'gap')} in the time stamps, the longest {longest['seconds']:.3g} s after frame "
                 f"{longest['after_frame']}",
                 "tracking may be lost there; cut the recording with --start and --end, or record without interruption",
             )

@@ -54,8 +54,8 @@ def picture_problems(facts: dict[str, Any]) -> list[Problem]:
         found.append(
             Problem(
                 f"{len(facts['unreadable'])} of {facts['sampled'] + len(facts['unreadable'])} sampled frames cannot be "
-                f"read, first {facts['unreadable'][0]}",
-                "they are skipped; copy or convert the recording again if they are many",
+                f"read, first {facts['unreadable'][0]}: {facts['unreadable_because']}",
+                "they are skipped; if they are many, copy or convert the recording again, all pictures in one size",
             )
         )
     if not DARK <= facts["brightness"] <= BRIGHT:
@@ -101,8 +101,16 @@ def picture_problems(facts: dict[str, Any]) -> list[Problem]:
     if facts["duplicates"] > 0.05:
         found.append(
             Problem(
-                f"{100 * facts['duplicates']:.0f} % of neighbouring frames show the same picture",
-                "harmless but slow; --stride 2 leaves most of them out",
+                f"{100 * facts['duplicates']:.0f} % of neighbouring frames show the same picture: frames are repeated, "
+                "or the camera hardly moves",
+                "harmless but slow; " + _fewer_frames(facts["duplicates"]),
             )
         )
     return found
+
+
+def _fewer_frames(duplicates: float) -> str:
+    """How to leave frames out of which this share equals the one before."""
+    if duplicates < 0.6:  # each picture twice is a half
+        return "--stride 2 leaves most of them out"
+    return "a --stride leaves most of them out, larger where the camera moves more slowly"

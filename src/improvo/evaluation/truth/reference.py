@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from improvo.errors import InputError
-from improvo.evaluation.truth.colmap_model import is_colmap_model, read_colmap_model
 from improvo.files import write_text
 from improvo.geometry.camera import Camera
 from improvo.geometry.camera_files import Calibration
+from improvo.geometry.colmap_model import is_colmap_model, read_colmap_model
 from improvo.geometry.se3 import inverse, quat_xyzw_from_rotation, rigid, rotation_from_quat_xyzw
 from improvo.geometry.text_files import decoded, read_text
 from improvo.geometry.trajectory_files import clean_poses, read_trajectory

@@ -40,6 +40,7 @@ class LocalMap:
         self.camera = camera
         self.store = PointStore()
         self.history: deque[View] = deque(maxlen=MEMORY_FRAMES)  # in order of processing, the newest last
+        self.refused = 0  # points of the view localised last, found at a place where the camera can hardly be
         self._settings = settings
         self._descriptor_distance = descriptor_distance
         self.refiner = KeypointRefiner(camera, settings.tolerance)
@@ -69,18 +70,18 @@ class LocalMap:
         Returns:
             Number of PnP inliers, and their share of the 3D-to-2D matches.
         """
+        self.refused = 0
         inherit_points(view, neighbour)
         inliers, share = self._solve_pose(view)
         if self._is_lost(inliers, share) or not self._from_same_side(view, neighbour):
             for earlier in reversed(self.history):
                 self._match_with(view, earlier)
                 inliers, share = self._solve_pose(view)
-                if (
-                    not self._is_lost(inliers, share)
-                    and self._from_same_side(view, earlier)
-                    and self._can_be_reached(view, neighbour)
-                ):
+                if self._is_lost(inliers, share):
+                    continue
+                if self._from_same_side(view, earlier) and self._can_be_reached(view, neighbour):
                     break
+                self.refused = max(self.refused, inliers)
             else:
                 view.cam_from_world = None
                 view.points[:] = NO_POINT

@@ -87,7 +87,7 @@ class RobustMapper(Mapper):
             return
         inliers, _ = self._map.localise(view, self._window.newest)
         if view.cam_from_world is None:
-            self._lose(view, inliers)
+            self._lose(view, inliers, self._map.refused)
             return
         self._recover_lost_frames(self._map, view)
         self._add(view)
@@ -249,11 +249,11 @@ class RobustMapper(Mapper):
 
     # LOST
 
-    def _lose(self, view: View, inliers: int) -> None:
+    def _lose(self, view: View, inliers: int, refused: int) -> None:
         """A frame without a pose; too many of them end the segment, and they begin the next."""
         self._states.frame_lost()
         self._buffer.append(view)
-        self._events.lost(view.frame_index, inliers)
+        self._events.lost(view.frame_index, inliers, refused)
         if len(self._buffer) > self._settings.loss.max_lost_frames:
             self._end_segment(_LOST)
 

@@ -45,9 +45,13 @@ class EventLog:
             self._add(frame_index, "initialising", reason)
             self._last_failure = reason
 
-    def lost(self, frame_index: int, inliers: int) -> None:
-        """A frame has no pose, because only `inliers` map points were found in it."""
-        self._add(frame_index, "lost", f"only {inliers} points of the map found")
+    def lost(self, frame_index: int, inliers: int, refused: int = 0) -> None:
+        """A frame has no pose: only `inliers` map points were found in it, or `refused` ones at an impossible place."""
+        elsewhere = (
+            f"{refused} points of the map found, but where the camera can hardly have come to: another place looks "
+            "alike, or frames are missing before it"
+        )
+        self._add(frame_index, "lost", elsewhere if refused else f"only {inliers} points of the map found")
 
     def contradicted(self, frame_index: int, consequence: str, by: str = "two-view geometry") -> None:
         """Something says that the map is wrong."""

@@ -30,7 +30,8 @@ _MEND = "run `improvo run` again"
 _FORMER_KINDS = {"waiting": "initialising"}  # of events
 _MENDS_OF_STARTS = {  # by a word of the reason
     "parallax": "the camera turned or stood still: move it sideways at the start (`improvo info` shows what it sees)",
-    "match": "`improvo info` tells whether the pictures are dark, blurred or without texture",
+    "match": "neighbouring frames show too little of the same place: give all frames of the video, without --stride, "
+    "or see by `improvo info` whether the pictures are dark, blurred or without texture",
 }
 
 

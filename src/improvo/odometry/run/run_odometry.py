@@ -114,7 +114,7 @@ def run_odometry(
         finally:
             visualizer.end()
         if len(processed) < _MIN_FRAMES and not interrupted:
-            raise InputError(f"{sequence.path}: only {len(processed)} of its frames can be read; check the recording")
+            raise InputError(f"{sequence.path}: only {len(processed)} of its frames can be read{_why_not(sequence)}")
         _remove_result(folder, settings)
     trajectory = odometry.trajectory
     write_trajectory(folder / "trajectory.txt", trajectory)
@@ -137,6 +137,14 @@ def _remove_result(folder: Path, settings: RunSettings) -> None:
     pictures = [path for path in (folder / "pictures").rglob("*") if _SHOWN.fullmatch(path.name)]
     for path in [*(folder / name for name in names), *pictures]:
         path.unlink(missing_ok=True)
+
+
+def _why_not(sequence: Sequence) -> str:
+    """What is wrong with the first frame that could not be read, and what to do."""
+    if not sequence.skipped:
+        return "; check the recording"
+    first = sequence.skipped[0]
+    return f" ({first.source} {first.reason}); give pictures that can all be read, of one size"
 
 
 def _track_all(

@@ -38,11 +38,26 @@ _OBSERVATION_BYTES = 24  # x, y, point
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """The images of a model and their one camera."""
+    """The images of a model, sorted by name."""
 
+    folder: Path
     names: tuple[str, ...]  # (N,) image files
     cam_from_world: Float64  # (N, 4, 4) in the unit of the model
-    calibration: Calibration
+    calibrations: tuple[Calibration, ...]  # (N,) the same one for all, or for each image its own
+
+    @property
+    def calibration(self) -> Calibration:
+        """The camera of all images.
+
+        Raises:
+            InputError: they have several.
+        """
+        used = set(self.calibrations)
+        if len(used) > 1:
+            raise InputError(
+                f"{self.folder}: its images have {len(used)} different cameras; make the model with a single one"
+            )
+        return used.pop()
 
 
 def is_colmap_model(folder: Path) -> bool:
@@ -51,17 +66,17 @@ def is_colmap_model(folder: Path) -> bool:
 
 
 def read_colmap_model(folder: Path) -> ColmapModel:
-    """The images of a model, sorted by name, and their camera.
+    """The images of a model with their cameras.
 
     Raises:
-        InputError: a damaged or missing file, an unknown camera model, no image, or images of several cameras.
+        InputError: a damaged or missing file, an unknown camera model, or no image.
     """
     binary = (folder / "images.bin").is_file()
     try:
         cameras = _binary_cameras(folder) if binary else _text_cameras(folder)
         images = _binary_images(folder) if binary else _text_images(folder)
         names, camera_ids, quat_xyzw, translation = zip(*sorted(images), strict=True) if images else ((), (), (), ())
-        used = {cameras[camera] for camera in camera_ids}
+        calibrations = tuple(cameras[camera] for camera in camera_ids)
     except OSError as error:
         raise InputError(
             f"{error.filename}: cannot be read ({error.strerror}); export the COLMAP model again"
@@ -70,10 +85,8 @@ def read_colmap_model(folder: Path) -> ColmapModel:
         raise InputError(f"{folder}: is a damaged COLMAP model ({error}); export it again") from None
     if not names:
         raise InputError(f"{folder}: has no registered image; give a model with poses")
-    if len(used) > 1:
-        raise InputError(f"{folder}: its images have {len(used)} different cameras; make the model with a single one")
     rotation = rotation_from_quat_xyzw(np.array(quat_xyzw))
-    return ColmapModel(tuple(names), rigid(rotation, np.array(translation)), used.pop())
+    return ColmapModel(folder, tuple(names), rigid(rotation, np.array(translation)), calibrations)
 
 
 _Image = tuple[str, int, tuple[float, ...], tuple[float, ...]]  # name, camera, quat_xyzw, translation
