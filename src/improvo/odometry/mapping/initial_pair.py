@@ -23,7 +23,9 @@ _MIN_INLIER_SHARE = 0.3  # essential inliers of the matches
 # points of a second motion over a plane, over those of the first: with more the choice between them is open.
 _MOSTLY = 0.75
 _MAX_SECOND_MOTION = 0.5  # spread over the picture of another motion, as a share of the first one's
-TWO_MOTIONS = "two motions: one of them is not the camera's"  # why no map starts; which one it is, two views do not say
+# Why no map starts where two motions explain two views: which one is the camera's, they do not say.
+TWO_MOTIONS = "two motions: one of them is not the camera's"
+PLANE_OF_TWO = "a plane with two possible motions"
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,11 @@ class InitFailure:
 
     reason: str
     costly: bool = False  # found after much work, so that the next try should not follow with the very next frame
+
+    @property
+    def undecided(self) -> bool:
+        """Whether two motions explain the views, so that the one that was taken before may be right."""
+        return self.reason in (TWO_MOTIONS, PLANE_OF_TWO)
 
 
 def initial_pair(
@@ -130,5 +137,5 @@ def _from_plane(
     if not pairs:
         return InitFailure("too little parallax")
     if len(pairs) > 1 and len(pairs[1].rows_a) > _MOSTLY * len(pairs[0].rows_a):
-        return InitFailure("a plane with two possible motions")
+        return InitFailure(PLANE_OF_TWO)
     return pairs[0]
