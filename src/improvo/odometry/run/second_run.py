@@ -26,10 +26,11 @@ from improvo.odometry.run.look_ahead import detected_ahead
 from improvo.odometry.verdict.path_error import error_percent
 from improvo.odometry.verdict.verdict import DOUBTFUL, RIGHT, Verdict
 from improvo.odometry.visual_odometry import VisualOdometry
-from improvo.types import Frame, Trajectory
+from improvo.types import Float64, Frame, Trajectory
 
 _CLOSE = (0.6, 3.0)  # times the limit: an estimated error between them is a close call
 _COVERED = 0.9  # of the segment's frames: what the second run must have with one scale
+_TURN_SECONDS, _MOST_TURNS = 1.0, 0.95
 _SAME = 0.5  # of the error that a segment may have: two paths that differ by less are one
 
 MakeOdometry = Callable[[Frontend], VisualOdometry]
@@ -43,7 +44,7 @@ class SecondPath:
     Attributes:
         frontend: name of the one that found its keypoints.
         difference_percent: of the positions after Sim3, % of the path; infinite where it has too few of the frames.
-        difference_deg: the largest, of a turn since the segment's first frame.
+        difference_deg: of a turn over a second, or over the whole of a shorter segment; all but a twentieth are less.
         believed: whether its own verdict is that it is right.
     """
 
@@ -112,10 +113,19 @@ def second_path(
     both = own & (again.segment == number)
     poses, poses_again = trajectory.world_from_cam[rows][both], again.world_from_cam[both]
     difference = error_percent(poses_again[:, :3, 3], poses[:, :3, 3])
-    turns, turns_again = (se3.inverse(each[:1])[:, :3, :3] @ each[:, :3, :3] for each in (poses, poses_again))
-    apart = se3.rotation_angle_deg(np.swapaxes(turns, 1, 2) @ turns_again)
+    turns, turns_again = (_turns(trajectory.times[rows][both], each) for each in (poses, poses_again))
+    apart = np.quantile(se3.rotation_angle_deg(np.swapaxes(turns, 1, 2) @ turns_again), _MOST_TURNS)
     believed = any(each.number == number and each.verdict.word == RIGHT for each in odometry.segments)
-    return SecondPath(frontend, difference, float(apart.max()), believed)
+    return SecondPath(frontend, difference, float(apart), believed)
+
+
+def _turns(times: Float64, world_from_cam: Float64) -> Float64:
+    """(M, 3, 3) turns over a second, or over all frames (N,) where they are less."""
+    later = np.searchsorted(times, times + _TURN_SECONDS)
+    first = np.flatnonzero(later < len(times))
+    begin, end = (first, later[first]) if len(first) else (np.array([0]), np.array([-1]))
+    turns: Float64 = se3.inverse(world_from_cam[begin])[:, :3, :3] @ world_from_cam[end, :3, :3]
+    return turns
 
 
 def close_calls_tracked_again(
