@@ -107,7 +107,7 @@ def second_path(
     rows = slice(segment.first, segment.first + len(again))
     own = trajectory.segment[rows] == segment.number
     numbers, counts = np.unique(again.segment[own & again.valid], return_counts=True)
-    if len(numbers) == 0 or counts.max() < _COVERED * own.sum():
+    if len(numbers) == 0 or counts.max() < _COVERED * segment.frames:
         return SecondPath(frontend, float("inf"), float("inf"), False)
     number = int(numbers[counts.argmax()])
     both = own & (again.segment == number)
