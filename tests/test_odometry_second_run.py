@@ -8,8 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from rendered_walk import CAMERA, render
 
 from improvo.frontend.registry import load_frontend
 from improvo.odometry.run.run_odometry import run_odometry
@@ -95,6 +97,21 @@ def test_two_believed_paths_that_differ_make_a_doubt(second: SecondPath) -> None
 def test_a_second_run_that_says_nothing_changes_nothing(second: SecondPath, word: str) -> None:
     verdict = Verdict(word, 4.0, evidence=("estimated",), limit=5.0)
     assert judged_again(verdict, second, 5.0) == verdict
+
+
+def test_a_second_run_to_which_the_camera_only_turns_makes_a_doubt(first: VisualOdometry) -> None:
+    poses = np.tile(np.eye(4), (24, 1, 1))
+    for number, angle in enumerate(np.linspace(0.0, 0.5, len(poses))):
+        poses[number, :3, :3] = cv2.Rodrigues(np.array([0.0, angle, 0.0]))[0]
+    rng = np.random.default_rng(0)
+    textures = [rng.integers(0, 255, (64, 64), np.uint8).repeat(8, 0).repeat(8, 1) for _ in range(5)]
+    frames = [Frame(number, number / 30, render(pose, textures), "turning") for number, pose in enumerate(poses)]
+    odometry = VisualOdometry(load_frontend("sift", 400), CAMERA)
+    second = second_path(replace(first.segments[0], last=23, frames=24), first.trajectory, frames, odometry, "sift")
+    assert second == SecondPath("sift", float("inf"), float("inf"), False, only_turns=True)
+    doubted = judged_again(Verdict(RIGHT, 3.4, limit=5.0), second, 5.0)
+    assert (doubted.word, doubted.error_percent) == (DOUBTFUL, 3.4)
+    assert doubted.evidence[0] == "tracked again with sift, a camera that only turns explains the motion"
 
 
 def test_a_second_run_has_keypoints_of_another_kind() -> None:

@@ -20,6 +20,7 @@ from improvo.frontend.settings import DEFAULT_FRONTEND
 from improvo.geometry import se3
 from improvo.jobs.interrupts import interrupts_wait
 from improvo.odometry.gates import SAME_TURN_DEG
+from improvo.odometry.mapping.initial_pair import NO_PARALLAX
 from improvo.odometry.result.events import Event
 from improvo.odometry.result.segments import Segment
 from improvo.odometry.run.look_ahead import detected_ahead
@@ -46,12 +47,14 @@ class SecondPath:
         difference_percent: of the positions after Sim3, % of the path; infinite where it has too few of the frames.
         difference_deg: of a turn over a second, or over the whole of a shorter segment; all but a twentieth are less.
         believed: whether its own verdict is that it is right.
+        only_turns: whether it finds no path at all, since a camera that only turns explains what it sees.
     """
 
     frontend: str
     difference_percent: float
     difference_deg: float
     believed: bool
+    only_turns: bool = False
 
 
 def is_close_call(verdict: Verdict) -> bool:
@@ -73,6 +76,9 @@ def judged_again(verdict: Verdict, second: SecondPath, max_error: float) -> Verd
         second: what the other run says.
         max_error: % of the path that a segment may be wrong by.
     """
+    if second.only_turns:
+        words = f"tracked again with {second.frontend}, a camera that only turns explains the motion"
+        return replace(verdict, word=DOUBTFUL, evidence=(words, *verdict.evidence))
     difference, turns_alike = second.difference_percent, second.difference_deg <= SAME_TURN_DEG
     said = f"tracked again with {second.frontend}, the path"
     if turns_alike and difference <= _SAME * max_error:
@@ -108,7 +114,9 @@ def second_path(
     own = trajectory.segment[rows] == segment.number
     numbers, counts = np.unique(again.segment[own & again.valid], return_counts=True)
     if len(numbers) == 0 or counts.max() < _COVERED * segment.frames:
-        return SecondPath(frontend, float("inf"), float("inf"), False)
+        said = [event.detail for event in odometry.events if event.kind == "initialising"]
+        only_turns = not again.valid.any() and bool(said) and all(words.startswith(NO_PARALLAX) for words in said)
+        return SecondPath(frontend, float("inf"), float("inf"), False, only_turns)
     number = int(numbers[counts.argmax()])
     both = own & (again.segment == number)
     poses, poses_again = trajectory.world_from_cam[rows][both], again.world_from_cam[both]
