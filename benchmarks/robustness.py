@@ -36,6 +36,7 @@ import cv2
 from improvo.backend.compile import compile_kernels
 from improvo.files import content_hash, write_json
 from improvo.frontend.registry import load_frontend
+from improvo.odometry.run.second_run import other_kind
 from robustness_cases import HALVES, REAL, Case, cases
 from robustness_features import FeatureCache
 from robustness_measures import NONE, RIGHT, run_and_judge
@@ -79,7 +80,8 @@ def _file(arguments: argparse.Namespace, case: Case, frontend: str) -> Path:
 
 
 def _run(missing: list[tuple[Case, str]], arguments: argparse.Namespace) -> None:
-    frontends = {name: load_frontend(name, MAX_KEYPOINTS) for name in dict.fromkeys(name for _, name in missing)}
+    names = dict.fromkeys(name for _, name in missing)
+    frontends = {name: load_frontend(name, MAX_KEYPOINTS) for name in [*names, *(other_kind(name) for name in names)]}
     folder, keep = arguments.cache / "features", not arguments.no_features
     caches = {name: FeatureCache(folder, each, name, keep) for name, each in frontends.items()}
     clip, clip_case = None, None
@@ -89,7 +91,7 @@ def _run(missing: list[tuple[Case, str]], arguments: argparse.Namespace) -> None
         for image in clip.images:  # not part of the time
             caches[name](image)
         start = time.process_time()
-        judged = run_and_judge(clip, caches[name], case.seed)
+        judged = run_and_judge(clip, caches[name], case.seed, caches[other_kind(name)])
         seconds = time.process_time() - start
         about = {"case": case.name, "group": case.group, "what": case.what, "half": case.half, "seed": case.seed}
         content = {**about, "frontend": name, "seconds": round(seconds, 2), **judged.as_json()}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ from improvo.odometry.gates import STEP_FRAMES
 from improvo.odometry.modes.states import TrackingState
 from improvo.odometry.result.events import Event
 from improvo.odometry.result.segments import Segment
+from improvo.odometry.run.second_run import close_calls_tracked_again
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.verdict.verdict import RIGHT as RIGHT_WORD
 from improvo.odometry.visual_odometry import VisualOdometry
@@ -134,8 +135,15 @@ class Judged:
         }
 
 
-def run_and_judge(clip: Clip, frontend: Frontend, seed: int) -> Judged:
-    """Track a clip, and hold what the odometry says against the truth."""
+def run_and_judge(clip: Clip, frontend: Frontend, seed: int, other: Frontend | None = None) -> Judged:
+    """Track a clip, and hold what the odometry says against the truth.
+
+    Args:
+        clip: pictures and truth.
+        frontend: of the run.
+        seed: of every RANSAC.
+        other: of another kind, for a second run over close calls; None: there is none.
+    """
     truth = clean_truth(Trajectory(clip.times, clip.world_from_cam))[0]
     odometry = VisualOdometry(frontend, clip.camera, OdometrySettings(seed=seed))
     contradictions = []
@@ -154,14 +162,35 @@ def run_and_judge(clip: Clip, frontend: Frontend, seed: int) -> Judged:
                 contradictions.append(Alarm(number, event.detail, error, right))
     odometry.finish()
     estimate = odometry.trajectory
+    final: Sequence[Segment] = odometry.segments
+    if other is not None:
+        final = _tracked_again(clip, odometry, other, seed)
     rotation_wrong = _rotation_wrong(estimate, truth)
-    segments = [_judged(segment, estimate, truth, rotation_wrong, odometry.events) for segment in odometry.segments]
+    segments = [_judged(segment, estimate, truth, rotation_wrong, odometry.events) for segment in final]
     alarms = contradictions + [
         Alarm(each.last, each.doubt, each.error_percent, each.right)
         for each in segments
         if each.doubt and not each.doubt.startswith(_NO_DOUBTS)
     ]
     return Judged(_frames(clip, estimate, rotation_wrong, segments), segments, alarms, list(odometry.events))
+
+
+def _tracked_again(clip: Clip, odometry: VisualOdometry, other: Frontend, seed: int) -> Sequence[Segment]:
+    """The segments as `improvo run` has them in the end."""
+    settings = OdometrySettings(seed=seed)
+
+    def frames(first: int, last: int) -> Iterator[Frame]:
+        for number in range(first, last + 1):
+            yield Frame(number, float(clip.times[number]), clip.images[number], f"picture {number}")
+
+    return close_calls_tracked_again(
+        odometry.segments,
+        odometry.trajectory,
+        frames,
+        lambda: (VisualOdometry(other, clip.camera, settings), other.name),
+        settings.verdict.max_error,
+        lambda _: None,
+    )[0]
 
 
 def doubt(segment: Segment, events: Sequence[Event]) -> str:

@@ -11,7 +11,7 @@ from simulated_features import CAMERA, hand_motion, observe, room, views_of
 from improvo.geometry import se3
 from improvo.odometry.alarms import second_opinion
 from improvo.odometry.alarms.second_opinion import SecondOpinion, explained_tracks, same_poses
-from improvo.odometry.mapping.initial_pair import TWO_MOTIONS, InitFailure
+from improvo.odometry.mapping.initial_pair import PLANE_OF_TWO, TWO_MOTIONS, InitFailure
 from improvo.odometry.result.events import EventLog
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
@@ -143,7 +143,7 @@ def test_a_dropped_map_that_nothing_follows_was_contradicted() -> None:
     assert [event.kind for event in log.events] == ["contradiction"]
 
 
-@pytest.mark.parametrize(("reason", "stays"), [(TWO_MOTIONS, True), ("too few matches", False)])
+@pytest.mark.parametrize(("reason", "stays"), [(TWO_MOTIONS, True), (PLANE_OF_TWO, True), ("too few matches", False)])
 def test_two_views_with_two_motions_give_up_no_map(
     monkeypatch: pytest.MonkeyPatch, reason: str, *, stays: bool
 ) -> None:

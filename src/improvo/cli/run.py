@@ -169,7 +169,7 @@ def _track(sequence: Sequence, folder: Path, settings: DenseRunSettings, viewer:
             shown.note("no pose yet" if frame.cam_from_world is None else "")
             shown.advance()
 
-        run = run_and_label(sequence, folder, settings, visualizer=viewer, progress=told)
+        run = run_and_label(sequence, folder, settings, visualizer=viewer, progress=told, note=shown.note)
     return with_camera_note(run, settings.sequence.camera)
 
 

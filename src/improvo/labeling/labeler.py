@@ -71,12 +71,15 @@ def run_and_label(
     frontend: Frontend | None = None,
     visualizer: Visualizer | None = None,
     progress: Callable[[TrackedFrame], None] | None = None,
+    note: Callable[[str], None] = lambda _: None,
 ) -> LabeledRun:
     """Track a sequence, label its tracks, and write trajectory, map, tracks, labels and report into `folder`.
 
     Arguments, errors and interrupts as `run_odometry`.
     """
-    summary = run_odometry(sequence, folder, settings, command, frontend, visualizer, progress, complete=False)
+    summary = run_odometry(
+        sequence, folder, settings, command, frontend, visualizer, progress, complete=False, note=note
+    )
     return apply_quality_gate(summary, settings.labels)
 
 

@@ -81,6 +81,8 @@ class VerdictSettings:
     """When a segment's path is believed (see `improvo.odometry.verdict`)."""
 
     max_error: float = 5.0  # % of the path; a larger estimated error makes a segment doubtful
+    # `improvo run` and `label` track a segment near that again, with keypoints of another kind, and compare the paths
+    second_run: bool = True
 
     def __post_init__(self) -> None:
         if not self.max_error > 0:

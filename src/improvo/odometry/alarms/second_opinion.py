@@ -17,7 +17,7 @@ from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.geometry.triangulation import triangulate_tracks
 from improvo.odometry.gates import SAME_TURN_DEG
-from improvo.odometry.mapping.initial_pair import TWO_MOTIONS, InitFailure
+from improvo.odometry.mapping.initial_pair import InitFailure
 from improvo.odometry.mapping.start import start_map
 from improvo.odometry.result.events import EventLog
 from improvo.odometry.settings import OdometrySettings
@@ -75,7 +75,7 @@ class SecondOpinion:
         copies = [view.unposed() for view in views]
         started = start_map(copies, self._camera, self._settings, self._descriptor_distance)
         if isinstance(started, InitFailure):
-            if started.reason != TWO_MOTIONS:
+            if not started.undecided:
                 return False
             self.undecided = True
             found = "has two motions to choose from, so it stays"  # as the two views had that spoke against it

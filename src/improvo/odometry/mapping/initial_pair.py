@@ -23,7 +23,10 @@ _MIN_INLIER_SHARE = 0.3  # essential inliers of the matches
 # points of a second motion over a plane, over those of the first: with more the choice between them is open.
 _MOSTLY = 0.75
 _MAX_SECOND_MOTION = 0.5  # spread over the picture of another motion, as a share of the first one's
-TWO_MOTIONS = "two motions: one of them is not the camera's"  # why no map starts; which one it is, two views do not say
+NO_PARALLAX = "too little parallax"
+# Why no map starts where two motions explain two views: which one is the camera's, they do not say.
+TWO_MOTIONS = "two motions: one of them is not the camera's"
+PLANE_OF_TWO = "a plane with two possible motions"
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,11 @@ class InitFailure:
 
     reason: str
     costly: bool = False  # found after much work, so that the next try should not follow with the very next frame
+
+    @property
+    def undecided(self) -> bool:
+        """Whether two motions explain the views, so that the one that was taken before may be right."""
+        return self.reason in (TWO_MOTIONS, PLANE_OF_TWO)
 
 
 def initial_pair(
@@ -75,9 +83,9 @@ def initial_pair(
     if inliers.sum() < max(_MIN_INLIER_SHARE * len(rows_a), least):
         return InitFailure("too few matches agree on a motion")
     if np.median(rotation_residuals(camera, pixels_a[inliers], pixels_b[inliers])) < gate(strict):
-        return InitFailure("too little parallax: a rotation explains the motion")
+        return InitFailure(f"{NO_PARALLAX}: a rotation explains the motion")
     if _rotation_explains_tracks(a, b, camera, settings):
-        return InitFailure("too little parallax: a rotation explains the tracks")
+        return InitFailure(f"{NO_PARALLAX}: a rotation explains the tracks")
     another = replace(ransac, max_iterations=1000)
     if has_second_motion(essential.pose, camera, pixels_a, pixels_b, another, _MAX_SECOND_MOTION):
         return InitFailure(TWO_MOTIONS)
@@ -115,7 +123,7 @@ def _with_points(
     parallax_deg = result.parallax_deg
     good = result.in_front & (worst <= gate(_STRICT * settings.tolerance)) & (parallax_deg > 0.25 * MIN_PARALLAX_DEG)
     if (parallax_deg[good] >= MIN_PARALLAX_DEG).sum() < settings.start.min_points:
-        return InitFailure("too little parallax")
+        return InitFailure(NO_PARALLAX)
     return InitialPair(b_from_a, rows_a[good], rows_b[good], result.points[good], parallax_deg[good])
 
 
@@ -128,7 +136,7 @@ def _from_plane(
     tried = [_with_points(a, b, rows_a, rows_b, b_from_a, camera, settings) for b_from_a in motions]
     pairs = sorted((pair for pair in tried if isinstance(pair, InitialPair)), key=lambda pair: -len(pair.rows_a))
     if not pairs:
-        return InitFailure("too little parallax")
+        return InitFailure(NO_PARALLAX)
     if len(pairs) > 1 and len(pairs[1].rows_a) > _MOSTLY * len(pairs[0].rows_a):
-        return InitFailure("a plane with two possible motions")
+        return InitFailure(PLANE_OF_TWO)
     return pairs[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from itertools import pairwise
@@ -19,6 +19,8 @@ from improvo.files import check_folder_format
 from improvo.formats import FORMAT, FORMAT_KEY, check_format
 from improvo.frontend import Frontend
 from improvo.geometry.ransac import robust_solver
+from improvo.odometry.result.events import Event
+from improvo.odometry.result.segments import Segment
 from improvo.odometry.run_settings import RunSettings
 from improvo.odometry.visual_odometry import VisualOdometry
 from improvo.sequences import Sequence
@@ -44,6 +46,8 @@ def run_json(
     interrupted: bool,
     tracks: Mapping[str, int],
     seconds: Mapping[str, float],
+    segments: Iterable[Segment],
+    events: Iterable[Event],
 ) -> dict[str, Any]:
     """The content of run.json.
 
@@ -56,6 +60,8 @@ def run_json(
         interrupted: whether the user ended the run early.
         tracks: counts of the tracks and labels that were written.
         seconds: by what was done, with their `total`.
+        segments: with their final verdicts.
+        events: of the odometry, and what came after it.
     """
     trajectory = odometry.trajectory
     has_pose = trajectory.valid
@@ -92,9 +98,9 @@ def run_json(
                 "mean_error": _number(segment.mean_error),
                 "verdict": segment.verdict.report(),
             }
-            for segment in odometry.segments
+            for segment in segments
         ],
-        "events": [asdict(event) for event in odometry.events],
+        "events": [asdict(event) for event in events],
         "points": len(odometry.map),
         "tracks": dict(tracks),
         "seconds": {name: round(value, 3) for name, value in seconds.items()},

@@ -5,29 +5,34 @@ from __future__ import annotations
 import re
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from improvo.errors import InputError
 from improvo.files import make_output_folder, write_json
 from improvo.frontend import Frontend
-from improvo.frontend.registry import frontend_from
+from improvo.frontend.registry import frontend_from, load_frontend
 from improvo.geometry.trajectory_files import write_trajectory
 from improvo.jobs.interrupts import interrupts_wait
+from improvo.odometry.result.events import Event
 from improvo.odometry.result.final_view import FinalView
+from improvo.odometry.result.segments import Segment
 from improvo.odometry.run.look_ahead import detected_ahead
 from improvo.odometry.run.map_file import write_map
 from improvo.odometry.run.point_colours import PointColours
 from improvo.odometry.run.run_json import run_json, unit_of
+from improvo.odometry.run.second_run import close_calls_tracked_again, other_kind
 from improvo.odometry.run.track_recorder import TrackRecorder
 from improvo.odometry.run_settings import RunSettings
 from improvo.odometry.visual_odometry import TrackedFrame, VisualOdometry
 from improvo.odometry.visualizer import NullVisualizer, Visualizer
 from improvo.sequences import Sequence
 from improvo.terminal import counted
-from improvo.types import Trajectory
+from improvo.types import Frame, Trajectory
 
 _ADDED = ("depth.zip", "dense.ply", "report.html")  # by later steps of some runs
 _SHOWN = re.compile(r"(map|(tracks|residuals|labels)(_\d+)?)\.(png|gif|webp|mp4|webm)")  # by `improvo show`
@@ -62,6 +67,7 @@ def run_odometry(
     visualizer: Visualizer | None = None,
     progress: Callable[[TrackedFrame], None] | None = None,
     complete: bool = True,
+    note: Callable[[str], None] = lambda _: None,
 ) -> RunSummary:
     """Track a sequence and write its trajectory, map, tracks and report into `folder`.
 
@@ -78,6 +84,7 @@ def run_odometry(
         visualizer: is shown every frame.
         progress: is called after every frame.
         complete: False leaves it to the caller to write run.json, after more files.
+        note: is told what is done after the last frame.
 
     Raises:
         InputError: fewer than three readable frames.
@@ -121,8 +128,19 @@ def run_odometry(
     sparse_map = odometry.map
     rgb = colours.read(sequence, processed, sparse_map.ids)
     write_map(folder / "map.ply", replace(sparse_map, rgb=rgb))
+    segments, events = odometry.segments, odometry.events
+    if settings.odometry.verdict.second_run and not interrupted and sequence.length is not None:
+        begun = time.perf_counter()
+        try:
+            segments, told = _close_calls_tracked_again(sequence, settings, frontend, odometry, processed, note)
+            events = (*events, *told)
+        except KeyboardInterrupt:
+            interrupted = True
+        seconds["track again"] = time.perf_counter() - begun
     seconds["total"] = time.perf_counter() - started
-    report = run_json(sequence, settings, frontend, odometry, processed, interrupted, recorder.counts, seconds)
+    report = run_json(
+        sequence, settings, frontend, odometry, processed, interrupted, recorder.counts, seconds, segments, events
+    )
     if complete:
         write_json(folder / "run.json", report)
     return RunSummary(folder, trajectory, report)
@@ -145,6 +163,30 @@ def _why_not(sequence: Sequence) -> str:
         return "; check the recording"
     first = sequence.skipped[0]
     return f" ({first.source} {first.reason}); give pictures that can all be read, of one size"
+
+
+def _close_calls_tracked_again(
+    sequence: Sequence,
+    settings: RunSettings,
+    frontend: Frontend,
+    odometry: VisualOdometry,
+    processed: list[int],
+    note: Callable[[str], None],
+) -> tuple[tuple[Segment, ...], tuple[Event, ...]]:
+    """See `improvo.odometry.run.second_run`."""
+    name = other_kind(frontend.name)
+
+    def again() -> tuple[VisualOdometry, str]:
+        other = load_frontend(name, settings.frontend.max_keypoints)
+        guess = sequence.settings.camera_is_guess
+        return VisualOdometry(other, sequence.camera, settings.odometry, camera_is_guess=guess), name
+
+    def frames(first: int, last: int) -> Iterator[Frame]:
+        for index in processed[first : last + 1]:
+            yield sequence[int(np.searchsorted(sequence.indices, index))]
+
+    max_error = settings.odometry.verdict.max_error
+    return close_calls_tracked_again(odometry.segments, odometry.trajectory, frames, again, max_error, note)
 
 
 def _track_all(
