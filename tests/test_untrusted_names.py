@@ -16,7 +16,7 @@ from improvo import config
 from improvo.cli.main import main
 from improvo.cli.train_options import read_data_card
 from improvo.continuation import SettingsRecord
-from improvo.errors import ConfigError, ImprovoError, InputError, OutputError
+from improvo.errors import ConfigError, ImprovoError, InputError, OutputError, first_line
 from improvo.evaluation.homography.pairs import Scene, open_scene
 from improvo.evaluation.settings import HomographySettings
 from improvo.evaluation.stability.causes import TrueCauses
@@ -34,7 +34,7 @@ from improvo.sequences.images import natural_key, read_image
 from improvo.sequences.mask import size_of
 from improvo.sequences.opening import FORMATS
 from improvo.stability.tables import read_points
-from improvo.untrusted.text import first_line, load_json, load_yaml, read_json_file
+from improvo.untrusted.text import load_json, load_yaml, read_json_file
 from sequence_builders import CAMERA, images, write_images
 from sequence_encoders import write_r3d
 

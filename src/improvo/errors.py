@@ -82,3 +82,8 @@ def imported(package: str, feature: str, extra: str) -> Any:
         return import_module(package)
     except ImportError:
         raise MissingExtraError(feature, extra) from None
+
+
+def first_line(error: BaseException) -> str:
+    """Of a foreign error whose further lines are a stack or advice; its kind, where it says nothing."""
+    return next((words for line in str(error).splitlines() if (words := line.strip())), type(error).__name__)

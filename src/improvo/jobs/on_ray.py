@@ -13,10 +13,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from improvo.errors import InputError, imported
+from improvo.errors import InputError, first_line, imported
 from improvo.jobs.processes import Job, Result, Tick
 from improvo.jobs.workers import ONE_THREAD, POLL_SECONDS, WorkerDiedError, with_errors_sent
-from improvo.untrusted.text import first_line
 
 _WAITING_PER_CORE = 2  # jobs handed to the cluster ahead of their turn
 _CANCEL_SECONDS = 10.0

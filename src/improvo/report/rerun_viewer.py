@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from improvo.errors import OutputError, imported
+from improvo.errors import OutputError, first_line, imported
 from improvo.files import check_output_file, written_atomically
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
@@ -25,7 +25,6 @@ from improvo.report.map_picture import map_colours
 from improvo.report.palettes import PALETTES, Palette
 from improvo.stability.rule import IGNORE
 from improvo.types import Float64, Frame, UInt8
-from improvo.untrusted.text import first_line
 
 _PROGRAM = "rerun"
 _OLD = 30  # frames; the last colour of the age of a track

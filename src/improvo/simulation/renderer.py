@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from improvo.errors import InputError, imported
+from improvo.errors import InputError, first_line, imported
 from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import rigid
 from improvo.simulation.scene import Scene
 from improvo.types import Float32, Float64, Int64, UInt8
-from improvo.untrusted.text import first_line
 
 _NEAR, _FAR = 0.05, 25.0  # metres
 _OPTIONS = """

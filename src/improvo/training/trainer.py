@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from improvo import files, terminal
-from improvo.errors import ImprovoError, InputError
+from improvo.errors import ImprovoError, InputError, first_line
 from improvo.formats import FORMAT, FORMAT_KEY, check_format
 from improvo.training.device import choose_device, choose_precision
 from improvo.training.distributed import Process
@@ -31,7 +31,6 @@ from improvo.training.metrics import METRICS, append_metrics, keep_metrics
 from improvo.training.settings import OptimiserSettings
 from improvo.training.shared_statistics import share_batch_norm
 from improvo.training.stages.base import Stage
-from improvo.untrusted.text import first_line
 
 CHECKPOINT = "checkpoint.pt"
 

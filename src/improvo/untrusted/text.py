@@ -124,11 +124,6 @@ def reason(error: BaseException) -> str:
     return " ".join(words.split())[:MAX_MESSAGE] or type(error).__name__
 
 
-def first_line(error: BaseException) -> str:
-    """Of a foreign error whose further lines are a stack or advice; its kind, where it says nothing."""
-    return next((words for line in str(error).splitlines() if (words := line.strip())), type(error).__name__)
-
-
 def _check_expanded(root: Any) -> None:
     """Refuse a document that is too large when each alias is written out, or that contains itself.
 

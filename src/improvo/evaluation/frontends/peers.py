@@ -15,11 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from improvo.errors import MissingExtraError
+from improvo.errors import MissingExtraError, first_line
 from improvo.frontend import Frontend
 from improvo.frontend.masking import without_masked
 from improvo.types import Features, Mask, UInt8
-from improvo.untrusted.text import first_line
 
 Extract = Callable[[Any], tuple[Any, Any, Any]]
 _CANDIDATES = 4  # times the keypoints, where a mask drops some of them
