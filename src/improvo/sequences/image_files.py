@@ -27,14 +27,14 @@ class ImageFiles:
     """Files by their number. `notes` say what was done to their grey levels and orientation.
 
     An EXIF rotation that all pictures share (a phone held upright) is applied. If it changes within a recording, none
-    is applied, because the calibration holds for the unrotated pictures.
+    is applied, because the calibration holds for the unrotated pictures. Files that are missing or empty say nothing.
     """
 
     def __init__(self, files: Iterable[Path], where: Path) -> None:
         self.files = list(files)
         self.notes: list[str] = []
         self._flags = _FLAGS
-        noted = [orientation(file) for file in self.files]
+        noted = [orientation(file) for file in self.files if _has_content(file)]
         turned = sum(value != _PLAIN for value in noted)
         if turned and len(set(noted)) > 1:
             self._flags |= cv2.IMREAD_IGNORE_ORIENTATION
@@ -89,6 +89,13 @@ class ImageFiles:
             if pictures[-1].dtype == np.uint8:
                 return None
         return stretch_of(pictures)
+
+
+def _has_content(path: Path) -> bool:
+    try:
+        return path.stat().st_size > 0
+    except (OSError, ValueError):
+        return False
 
 
 def orientation(path: Path) -> int:
