@@ -16,7 +16,7 @@ import ros_encoders
 import sequence_encoders as encoders
 from improvo.errors import ImprovoError, InputError
 from improvo.sequences import open_sequence
-from sequence_builders import CAMERA, depths, images, poses
+from sequence_builders import CAMERA, depths, images, poses, write_images
 from sequence_encoders import Scene
 
 COUNT = 5
@@ -230,6 +230,20 @@ def test_euroc_tables_with_bad_rows(tmp_path: Path) -> None:
 
 
 def test_euroc_with_a_transform_that_is_none(tmp_path: Path) -> None:
+def test_euroc_stamps_beyond_64_bits_are_bad_rows(tmp_path: Path) -> None:
+    encoders.write_euroc(tmp_path, scene(), np.eye(4))
+    table = tmp_path / "mav0" / "cam0" / "data.csv"
+    rows = table.read_text().splitlines()
+    late = f"{2**63},{rows[2].split(',')[1]}"
+    table.write_text("\n".join([*rows[:2], late, *rows[3:]]))
+    sequence = open_sequence(tmp_path)
+    assert len(sequence) == COUNT - 1
+    assert any("1 rows are not" in note for note in sequence.notes)
+    table.unlink()  # the names of the files are the stamps
+    write_images(table.with_name("data"), images(1), f"{2**63}.png")
+    assert len(open_sequence(tmp_path)) == COUNT
+
+
     encoders.write_euroc(tmp_path, scene(), np.eye(4))
     sensor = tmp_path / "mav0" / "cam0" / "sensor.yaml"
     sensor.write_text(sensor.read_text().replace("data: [1.0, 0.0", "data: [3.0, 0.0"))
