@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -279,3 +280,22 @@ def test_polycam_images_without_camera_are_left_out_and_counted(tmp_path: Path) 
     sequence = open_sequence(folder)
     assert len(sequence) == COUNT - 1
     assert any("1 of 5 images have no camera file" in note for note in sequence.notes)
+
+
+def test_a_phone_that_claims_pictures_of_no_size_has_no_depth(tmp_path: Path) -> None:
+    folder = encoders.write_polycam(tmp_path, scene())
+    for file in (folder / "keyframes" / "cameras").iterdir():
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"width": 2e9, "height": 2e9}))
+    depth = folder / "keyframes" / "depth"
+    for file in depth.iterdir():
+        assert cv2.imwrite(str(file), np.full((4, 4), 1000, np.uint16))
+    assert open_sequence(folder, fov=60.0).depth(0) is None
+
+
+def test_a_scannet_scene_with_other_pictures_beside_its_frames(tmp_path: Path) -> None:
+    write_images(tmp_path, images(2), "frame-{:06d}.color.png")
+    write_images(tmp_path, images(1), "abcdef{}.color.png")
+    K = " ".join(map(str, np.diag([90.0, 90.0, 1.0, 1.0]).ravel()))
+    (tmp_path / "_info.txt").write_text(f"m_colorWidth = 96\nm_colorHeight = 72\nm_calibrationColorIntrinsic = {K}\n")
+    sequence = open_sequence(tmp_path)
+    assert (sequence.format, len(sequence)) == ("scannet", 2)
