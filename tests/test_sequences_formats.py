@@ -131,6 +131,24 @@ def test_kitti_copies_of_courses_name_no_camera_in_their_calibration(tmp_path: P
     np.testing.assert_allclose(sequence.camera.K, CAMERA.K, atol=1e-9)
     np.testing.assert_allclose(sequence.times, np.arange(COUNT) / 10)
     expected = poses(COUNT) @ inverse(cam_from_cam0) if folder == "image_r" else poses(COUNT)
+@pytest.mark.parametrize("timed", [True, False])
+def test_kitti_pictures_that_are_missing_shift_no_other(tmp_path: Path, timed: bool) -> None:
+    pictures, there = images(COUNT), [1, 2, *range(4, COUNT)]
+    for number in there:
+        write_images(tmp_path / "image_0", [pictures[number]], f"{number:06d}.png")
+    np.savetxt(tmp_path / "calib.txt", [(CAMERA.K @ np.eye(4)[:3]).ravel()])
+    np.savetxt(tmp_path / "poses.txt", poses(COUNT)[:, :3].reshape(COUNT, 12))
+    step = 0.25 if timed else 0.1
+    if timed:
+        (tmp_path / "times.txt").write_text("".join(f"{step * i}\n" for i in range(COUNT)))
+    sequence = open_sequence(tmp_path)
+    np.testing.assert_allclose(sequence.times, step * np.array(there))
+    assert all((frame.image == pictures[number]).all() for frame, number in zip(sequence, there, strict=True))
+    assert sequence.ground_truth is not None
+    np.testing.assert_allclose(sequence.ground_truth.world_from_cam, poses(COUNT)[there], atol=1e-9)
+    assert sequence.notes == ((f"{tmp_path}: 2 of {COUNT} images are missing",) if timed else ())
+
+
     assert sequence.ground_truth is not None
     np.testing.assert_allclose(sequence.ground_truth.world_from_cam, expected, atol=1e-9)
 
