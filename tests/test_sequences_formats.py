@@ -96,6 +96,18 @@ def test_seven_scenes(tmp_path: Path) -> None:
     np.testing.assert_allclose(sequence.ground_truth.world_from_cam, poses(COUNT), atol=1e-9)
 
 
+def test_seven_scenes_pictures_of_one_number_are_chosen_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("frame-000000.color.jpg", "frame-000000.color.png", "frame-000001.color.png"):
+        write_images(tmp_path, images(1), name)
+    listed = list(tmp_path.iterdir())
+    for order in (sorted(listed), sorted(listed, reverse=True)):  # a file system lists files in any order
+        monkeypatch.setattr(Path, "iterdir", lambda self, order=order: iter(order))
+        recording = open_recording(tmp_path)
+        assert [Path(recording.source(row)).suffix for row in range(2)] == [".png", ".png"]
+
+
 @pytest.mark.parametrize("number", [0, 2])
 def test_kitti_uses_the_projection_of_its_camera(tmp_path: Path, number: int) -> None:
     folder = tmp_path / "sequences" / "04"
@@ -119,18 +131,6 @@ def test_kitti_uses_the_projection_of_its_camera(tmp_path: Path, number: int) ->
     np.testing.assert_allclose(sequence.ground_truth.world_from_cam, poses(COUNT) @ inverse(cam_from_cam0), atol=1e-9)
 
 
-@pytest.mark.parametrize("folder", ["image_l", "image_r", "image_0"])
-def test_kitti_copies_of_courses_name_no_camera_in_their_calibration(tmp_path: Path, folder: str) -> None:
-    write_images(tmp_path / folder, images(COUNT))
-    cam_from_cam0 = rigid(np.eye(3), np.array([-0.54, 0.0, 0.0]))
-    projections = [CAMERA.K @ np.eye(4)[:3], CAMERA.K @ cam_from_cam0[:3]]
-    np.savetxt(tmp_path / "calib.txt", [projection.ravel() for projection in projections])
-    np.savetxt(tmp_path / "poses.txt", poses(COUNT)[:, :3].reshape(COUNT, 12))
-    sequence = open_sequence(tmp_path)
-    assert sequence.format == "kitti"
-    np.testing.assert_allclose(sequence.camera.K, CAMERA.K, atol=1e-9)
-    np.testing.assert_allclose(sequence.times, np.arange(COUNT) / 10)
-    expected = poses(COUNT) @ inverse(cam_from_cam0) if folder == "image_r" else poses(COUNT)
 @pytest.mark.parametrize("timed", [True, False])
 def test_kitti_pictures_that_are_missing_shift_no_other(tmp_path: Path, timed: bool) -> None:
     pictures, there = images(COUNT), [1, 2, *range(4, COUNT)]
@@ -149,6 +149,18 @@ def test_kitti_pictures_that_are_missing_shift_no_other(tmp_path: Path, timed: b
     assert sequence.notes == ((f"{tmp_path}: 2 of {COUNT} images are missing",) if timed else ())
 
 
+@pytest.mark.parametrize("folder", ["image_l", "image_r", "image_0"])
+def test_kitti_copies_of_courses_name_no_camera_in_their_calibration(tmp_path: Path, folder: str) -> None:
+    write_images(tmp_path / folder, images(COUNT))
+    cam_from_cam0 = rigid(np.eye(3), np.array([-0.54, 0.0, 0.0]))
+    projections = [CAMERA.K @ np.eye(4)[:3], CAMERA.K @ cam_from_cam0[:3]]
+    np.savetxt(tmp_path / "calib.txt", [projection.ravel() for projection in projections])
+    np.savetxt(tmp_path / "poses.txt", poses(COUNT)[:, :3].reshape(COUNT, 12))
+    sequence = open_sequence(tmp_path)
+    assert sequence.format == "kitti"
+    np.testing.assert_allclose(sequence.camera.K, CAMERA.K, atol=1e-9)
+    np.testing.assert_allclose(sequence.times, np.arange(COUNT) / 10)
+    expected = poses(COUNT) @ inverse(cam_from_cam0) if folder == "image_r" else poses(COUNT)
     assert sequence.ground_truth is not None
     np.testing.assert_allclose(sequence.ground_truth.world_from_cam, expected, atol=1e-9)
 
