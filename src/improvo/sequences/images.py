@@ -198,10 +198,11 @@ def is_file(path: Path) -> bool:
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:
-    """Sorts numbers in names by value, however long they are."""
+    """Sorts numbers in names by value, however long they are; 07 before 7, in whatever order a folder lists them."""
     parts = [part for part in re.split(r"(\d+)", name) if part]
     digits = [part.lstrip("0") if part.isdecimal() else "" for part in parts]
-    return [(len(n), n) if part.isdecimal() else (-1, part) for part, n in zip(parts, digits, strict=True)]
+    by_value = [(len(n), n) if part.isdecimal() else (-1, part) for part, n in zip(parts, digits, strict=True)]
+    return [*by_value, (-2, name)]
 
 
 def file_bytes(path: Path) -> bytes:
