@@ -30,6 +30,7 @@ from improvo.odometry.run_folder import RunFolder
 from improvo.odometry.run_settings import RunSettings
 from improvo.sequences import SequenceSettings, open_sequence
 from improvo.sequences.base import UnreadableFrameError
+from improvo.sequences.given_files import mask_content
 from improvo.sequences.images import natural_key, read_image
 from improvo.sequences.mask import size_of
 from improvo.sequences.opening import FORMATS
@@ -107,6 +108,15 @@ def test_natural_order_of_any_numbers() -> None:
     assert ordered == otherwise  # also of numbers that are the same
     assert ordered[:4] == ["a1", "a1²3", "a02", "a2"]
     assert ordered.index("a2") < ordered.index("a10") < ordered.index("a" + "9" * 4000) < ordered.index("a" + DIGITS)
+
+
+def test_a_mask_whose_name_is_no_text(tmp_path: Path) -> None:
+    with open(os.fsencode(tmp_path) + b"/\xff.png", "wb") as file:
+        file.write(b"white")
+    before = mask_content(SequenceSettings(mask=str(tmp_path)))
+    os.rename(os.fsencode(tmp_path) + b"/\xff.png", os.fsencode(tmp_path) + b"/\xfe.png")
+    assert before.startswith("sha256:")
+    assert mask_content(SequenceSettings(mask=str(tmp_path))) != before
 
 
 def test_a_file_whose_name_is_no_text(tmp_path: Path) -> None:
