@@ -230,7 +230,6 @@ def test_euroc_tables_with_bad_rows(tmp_path: Path) -> None:
     assert "1 rows repeat" in notes
 
 
-def test_euroc_with_a_transform_that_is_none(tmp_path: Path) -> None:
 def test_euroc_stamps_beyond_64_bits_are_bad_rows(tmp_path: Path) -> None:
     encoders.write_euroc(tmp_path, scene(), np.eye(4))
     table = tmp_path / "mav0" / "cam0" / "data.csv"
@@ -245,6 +244,7 @@ def test_euroc_stamps_beyond_64_bits_are_bad_rows(tmp_path: Path) -> None:
     assert len(open_sequence(tmp_path)) == COUNT
 
 
+def test_euroc_with_a_transform_that_is_none(tmp_path: Path) -> None:
     encoders.write_euroc(tmp_path, scene(), np.eye(4))
     sensor = tmp_path / "mav0" / "cam0" / "sensor.yaml"
     sensor.write_text(sensor.read_text().replace("data: [1.0, 0.0", "data: [3.0, 0.0"))
