@@ -94,13 +94,14 @@ def _inertial_poses(folder: Path, day: Path, number: str) -> tuple[Trajectory | 
         return None, []
     numbers = [number for number, _ in known]
     rows = np.array([_oxts_row(file) for _, file in known])
-    scale = np.cos(np.radians(rows[0, 0]))
+    whole = int(np.argmax(np.isfinite(rows).all(axis=1)))  # the first that is not damaged
+    scale = np.cos(np.radians(rows[whole, 0]))
     east = scale * np.radians(rows[:, 1]) * EARTH_RADIUS
     north = scale * EARTH_RADIUS * np.log(np.tan(np.radians(90 + rows[:, 0]) / 2))
     place = np.stack([east, north, rows[:, 2]], axis=1)
     axes = np.eye(3)
     turn = [so3_exp(rows[:, 3 + axis, None] * axes[axis]) for axis in range(3)]  # roll, pitch, yaw
-    world_from_imu = rigid(turn[2] @ turn[1] @ turn[0], place - place[0])
+    world_from_imu = rigid(turn[2] @ turn[1] @ turn[0], place - place[whole])
     poses = clean_poses(world_from_imu @ inverse(cam_from_imu))[0]
     order, _ = increasing_order(times[numbers])
     stamps = times[numbers][order]
