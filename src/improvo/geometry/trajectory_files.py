@@ -28,6 +28,7 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")
 _TUM_HEADER = "# camera-to-world, {}: timestamp tx ty tz qx qy qz qw\n"
 _EUROC_NAMES = re.compile(r"^#?\s*timestamp\s*\[ns\]", re.IGNORECASE)
+_OWN_HEADER = _TUM_HEADER.partition("{")[0]
 _SEGMENT_COMMENT = re.compile(r"#\s*segment\s+(\d+)\s*(?::|$)")
 
 
@@ -37,7 +38,7 @@ def read_trajectory(path: Path | str, format: str = "auto", times: Float64 | Non
 
 
 def read_trajectory_report(
-    path: Path | str, format: str = "auto", times: Float64 | None = None
+    path: Path | str, format: str = "auto", times: Float64 | None = None, numbered: bool = False
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """The trajectory of a TUM, KITTI or EuRoC file, and one line for each kind of problem in it.
 
@@ -46,6 +47,7 @@ def read_trajectory_report(
         format: `tum`, `kitti`, `euroc`, or `auto` to tell by the columns.
         times: seconds, for KITTI's rows, which have none; without it `times.txt` beside the file, or 10 Hz.
 
+        numbered: the first column of a TUM file is a number of frames: taken as it stands, whatever its size.
     Returns:
         The trajectory, sorted by time, bad rows NaN; and the problems.
 
@@ -70,7 +72,11 @@ def read_trajectory_report(
             raise InputError(f"{path}: has {len(values)} poses but there are {len(stamps)} times; remove what is extra")
         stamps = stamps[: len(values)]
     else:
-        stamps, unit = (values[:, 0] * 1e-9, None) if format == "euroc" else in_seconds(values[:, 0])
+        stamps, unit = values[:, 0], None
+        if format == "euroc":
+            stamps = stamps * 1e-9
+        elif not numbered and not lines[0].startswith(_OWN_HEADER):  # what we write is in seconds
+            stamps, unit = in_seconds(stamps)
         problems += (note_of(unit),) if unit else ()
         w_first = (_quaternion_order(lines) or ("wxyz" if format == "euroc" else "xyzw")) == "wxyz"
         quat_xyzw = values[:, [5, 6, 7, 4]] if w_first else values[:, 4:8]
