@@ -275,3 +275,13 @@ def test_a_damaged_first_row_of_the_inertial_unit_costs_that_pose_alone(tmp_path
     # positions count from the first place that is known
     moved = whole.camera_centers[1:] - whole.camera_centers[1]
     np.testing.assert_allclose(truth.camera_centers[1:] - truth.camera_centers[1], moved, rtol=0, atol=1e-6)
+
+
+def test_true_poses_without_times_follow_the_pictures_at_any_rate(tmp_path: Path) -> None:
+    path = folder(tmp_path / "s", "".join(f"{0.1 * i}\n" for i in range(COUNT)))
+    np.savetxt(path / "groundtruth.txt", poses(COUNT)[:, :3].reshape(COUNT, 12))
+    for settings in ({}, {"fps": 20.0}):
+        sequence = open_sequence(path, fov=60.0, **settings)
+        np.testing.assert_allclose(sequence.times, np.arange(COUNT) * (0.05 if settings else 0.1))
+        assert sequence.ground_truth is not None
+        np.testing.assert_allclose(sequence.ground_truth.world_from_cam, poses(COUNT), rtol=0, atol=1e-9)

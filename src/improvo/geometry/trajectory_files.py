@@ -272,12 +272,17 @@ def _from_quaternions(quat_xyzw: Float64, translation: Float64) -> Float64:
     return rigid(rotation, translation)
 
 
-def has_times(path: Path) -> bool:
-    """Whether the rows of a trajectory file have times: KITTI's have none, unless a `times.txt` beside it fits."""
+def has_times(path: Path, beside: bool = True) -> bool:
+    """Whether the rows of a trajectory file have times: KITTI's have none, unless a `times.txt` beside it fits.
+
+    Args:
+        path: of the file.
+        beside: whether a `times.txt` counts.
+    """
     lines = read_text(path, "a trajectory", "give a TUM, KITTI or EuRoC file").splitlines()
     if _guess(lines, path) != "kitti":
         return True
-    return not _kitti_times(path, len(_rows(lines, 12, all_count=True)[0]))[1]
+    return beside and not _kitti_times(path, len(_rows(lines, 12, all_count=True)[0]))[1]
 
 
 def _kitti_times(path: Path, count: int) -> tuple[Float64, tuple[str, ...]]:
