@@ -313,6 +313,7 @@ def test_kitti_rows_without_times_count_the_rows_of_a_timed_file(tmp_path: Path)
     rows = (tmp_path / "kitti.txt").read_text().splitlines()
     (tmp_path / "kitti.txt").write_text("\n".join(rows[:-1]))
     with pytest.raises(InputError, match=r"kitti.txt: has 100 poses without times, and the other 101; put a times.txt"):
+        assert not any("10 poses per second" in note for note in notes)
         read_pair(tmp_path / "kitti.txt", tmp_path / "truth.txt")
     (tmp_path / "times.txt").write_text("".join(f"{time}\n" for time in truth.times))
     assert len(read_pair(tmp_path / "kitti.txt", tmp_path / "truth.txt")[0]) == 100
@@ -321,6 +322,29 @@ def test_kitti_rows_without_times_count_the_rows_of_a_timed_file(tmp_path: Path)
 def test_the_api_holds_the_same_files_against_each_other_as_the_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+def test_what_is_odd_in_kitti_rows_is_told_though_they_count_others(tmp_path: Path) -> None:
+    from improvo.evaluation.trajectory.pair import read_pair
+    from improvo.geometry.trajectory_files import write_trajectory
+
+    truth = wander(5, 20)
+    write_trajectory(tmp_path / "kitti.txt", truth, "kitti")
+    rows = (tmp_path / "kitti.txt").read_text().splitlines()
+    (tmp_path / "kitti.txt").write_text("\n".join([*rows[:7], "lost", *rows[8:]]))
+    estimate, _, notes = read_pair(tmp_path / "kitti.txt", truth)
+    assert np.flatnonzero(~estimate.valid).tolist() == [7]
+    assert any("not numbers (line 8)" in note for note in notes)
+
+
+def test_a_recording_of_one_file_may_be_the_truth(tmp_path: Path) -> None:
+    from improvo.evaluation.trajectory.pair import read_pair
+
+    path = encoders.write_transforms(tmp_path, scene()) / "transforms.json"
+    truth = open_recording(path).ground_truth
+    assert truth is not None
+    _, found, _ = read_pair(truth, path)
+    np.testing.assert_allclose(found.world_from_cam, truth.world_from_cam, rtol=0, atol=1e-12)
+
+
     import improvo
     from improvo.cli.main import main
     from improvo.geometry.trajectory_files import write_trajectory

@@ -24,11 +24,12 @@ from improvo.types import Float64, Int64, Trajectory
 from improvo.untrusted.text import is_number
 
 RIGID_TOLERANCE = 1e-2
+NO_TIMES = "has no times; 10 poses per second assumed, as in KITTI"
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")
 _TUM_HEADER = "# camera-to-world, {}: timestamp tx ty tz qx qy qz qw\n"
-_EUROC_NAMES = re.compile(r"^#?\s*timestamp\s*\[ns\]", re.IGNORECASE)
 _OWN_HEADER = _TUM_HEADER.partition("{")[0]
+_EUROC_NAMES = re.compile(r"^#?\s*timestamp\s*\[ns\]", re.IGNORECASE)
 _SEGMENT_COMMENT = re.compile(r"#\s*segment\s+(\d+)\s*(?::|$)")
 
 
@@ -46,8 +47,8 @@ def read_trajectory_report(
         path: the file.
         format: `tum`, `kitti`, `euroc`, or `auto` to tell by the columns.
         times: seconds, for KITTI's rows, which have none; without it `times.txt` beside the file, or 10 Hz.
-
         numbered: the first column of a TUM file is a number of frames: taken as it stands, whatever its size.
+
     Returns:
         The trajectory, sorted by time, bad rows NaN; and the problems.
 
@@ -116,9 +117,9 @@ def write_trajectory(path: Path | str, trajectory: Trajectory, format: str = "tu
     if format == "kitti":
         if not trajectory.valid.all():
             raise InputError(f"{path}: a KITTI file cannot leave out poses; write a TUM file instead")
-        rows = (" ".join(f"{value:.12g}" for value in pose[:3].ravel()) for pose in trajectory.world_from_cam)
         if len(np.unique(trajectory.segment)) > 1:
             raise InputError(f"{path}: a KITTI file cannot tell one segment from another; write a TUM file instead")
+        rows = (" ".join(f"{value:.12g}" for value in pose[:3].ravel()) for pose in trajectory.world_from_cam)
         write_text(path, "".join(f"{row}\n" for row in rows))
     elif format == "tum":
         write_text(path, tum_text(trajectory, unit))
@@ -292,7 +293,7 @@ def _kitti_times(path: Path, count: int) -> tuple[Float64, tuple[str, ...]]:
         times = read_times(beside)[0]
         if len(times) >= count:
             return times[:count], ()
-    return np.arange(count) / 10.0, ("has no times; 10 poses per second assumed, as in KITTI",)
+    return np.arange(count) / 10.0, (NO_TIMES,)
 
 
 def read_times(path: Path) -> tuple[Float64, tuple[str, ...]]:

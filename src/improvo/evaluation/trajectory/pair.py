@@ -7,7 +7,7 @@ from pathlib import Path
 
 from improvo.errors import InputError
 from improvo.evaluation.truth.reference import lacks_times
-from improvo.geometry.trajectory_files import has_times, read_trajectory_report
+from improvo.geometry.trajectory_files import NO_TIMES, has_times, read_trajectory_report
 from improvo.odometry.run_folder import RunFolder, why_no_pose
 from improvo.sequences.base import SequenceSettings
 from improvo.sequences.opening import true_trajectory
@@ -126,6 +126,6 @@ def _at_rows_of(counted: _Side, timed: _Side) -> _Side:
     """Poses without times at the times of the same number of other poses, with a note that says so."""
     rows, poses = len(timed.trajectory), counted.trajectory
     note = f"{counted.name}: has no times; its {rows} poses are taken as the {rows} of {timed.name}, row by row"
-    return replace(
-        counted, trajectory=Trajectory(timed.trajectory.times, poses.world_from_cam, poses.segment), notes=(note,)
-    )
+    others = tuple(each for each in counted.notes if not each.endswith(NO_TIMES))
+    at_times = Trajectory(timed.trajectory.times, poses.world_from_cam, poses.segment)
+    return replace(counted, trajectory=at_times, notes=(note, *others))
