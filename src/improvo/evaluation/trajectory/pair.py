@@ -10,7 +10,7 @@ from improvo.evaluation.truth.reference import lacks_times
 from improvo.geometry.trajectory_files import NO_TIMES, has_times, read_trajectory_report
 from improvo.odometry.run_folder import RunFolder, why_no_pose
 from improvo.sequences.base import SequenceSettings
-from improvo.sequences.opening import true_trajectory
+from improvo.sequences.opening import is_recording, true_trajectory
 from improvo.types import Trajectory
 
 
@@ -91,7 +91,7 @@ def _truth(given: Trajectory | Path, sequence: SequenceSettings | None, referenc
         raise InputError(f"{given}: has no times; give the sequence as TRUTH, and this with --truth")
     if (given / "run.json").is_file():
         return _of_run(given)
-    if not given.is_dir():
+    if not (given.is_dir() or (given.is_file() and is_recording(given))):
         return _of_file(given)
     found = true_trajectory(given, sequence)
     if found is None:
