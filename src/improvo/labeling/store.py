@@ -250,7 +250,7 @@ def read_records(folder: Path) -> list[SequenceRecord]:
     files = [*folder.glob(f"*/{RECORD_FILE}"), *folder.glob(".*.failed.json")]
     records: dict[str, SequenceRecord] = {}
     for file in files:
-        if file.parent.name.endswith(".partial"):
+        if file.parent.name.startswith("."):  # in work; no sequence has a name like that
             continue
         record = _read_record(file)
         records.setdefault(record.name, record)  # labels come before an older failure of the same sequence
