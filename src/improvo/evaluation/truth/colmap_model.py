@@ -62,6 +62,7 @@ def read_colmap_model(folder: Path) -> ColmapModel:
         images = _binary_images(folder) if binary else _text_images(folder)
         names, camera_ids, quat_xyzw, translation = zip(*sorted(images), strict=True) if images else ((), (), (), ())
         used = {cameras[camera] for camera in camera_ids}
+        rotation = rotation_from_quat_xyzw(np.array(quat_xyzw).reshape(-1, 4))
     except OSError as error:
         raise InputError(
             f"{error.filename}: cannot be read ({error.strerror}); export the COLMAP model again"
@@ -72,7 +73,6 @@ def read_colmap_model(folder: Path) -> ColmapModel:
         raise InputError(f"{folder}: has no registered image; give a model with poses")
     if len(used) > 1:
         raise InputError(f"{folder}: its images have {len(used)} different cameras; make the model with a single one")
-    rotation = rotation_from_quat_xyzw(np.array(quat_xyzw))
     return ColmapModel(tuple(names), rigid(rotation, np.array(translation)), used.pop())
 
 
