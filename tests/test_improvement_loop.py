@@ -21,7 +21,8 @@ from rendered_walk import write_walk
 
 from improvement_example import SETTINGS, FakeTraining, run
 from improvo.errors import ConfigError, ImprovoError, InputError, OutputError
-from improvo.frontend.weights import load_weights
+from improvo.frontend.weights import find_weights, load_weights, save_weights
+from improvo.improvement import improve as loop
 from improvo.improvement.decision import rule, why_not_better
 from improvo.improvement.improve import Improvement
 from improvo.improvement.progress import ImprovementProgress
@@ -583,3 +584,22 @@ def test_what_makes_an_earlier_recording_worse_is_not_better() -> None:
     assert not is_better(both(0.6, 0.58), start, start, settings)
     assert not is_better(both(0.5, 0.7), start, start, settings)
     assert both(0.6, 0.2).mean("right_8px") == pytest.approx(0.6)
+
+
+@pytest.mark.parametrize("earlier", [False, True])
+def test_the_card_says_the_rule_that_was_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, earlier: bool) -> None:
+    monkeypatch.setattr(loop, "write_report", lambda *rest: None)
+    start = Candidate("start", tmp_path / "start")
+    start.folder.mkdir()
+    weights = load_weights(find_weights("superpoint-small"))
+    save_weights(start.weights, weights.tensors, weights.card)
+    measured = validation([0.5] * 15)
+    if earlier:
+        before = replace(measured.scores[0], recording="before/room", earlier=True)
+        measured = replace(measured, scores=(*measured.scores, before))
+    folder: Any = SimpleNamespace(weights=tmp_path / "weights.safetensors", report=None, finished_rounds=lambda: 0)
+    split: Any = None
+    loop._keep(Improvement(folder.weights, 0, (start,), (measured,)), folder, split, ImproveSettings())
+    said = load_weights(folder.weights).card.metrics["improvement"]["rule"]
+    assert said == rule(ValidationSettings(), earlier)
+    assert ("In no recording of an earlier run" in said) == earlier
