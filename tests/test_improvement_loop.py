@@ -12,6 +12,8 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,13 +22,18 @@ import yaml
 from rendered_walk import write_walk
 
 from improvement_example import SETTINGS, FakeTraining, run
+from improvo import config
 from improvo.errors import ConfigError, ImprovoError, InputError, OutputError
 from improvo.frontend.weights import find_weights, load_weights, save_weights
 from improvo.improvement import improve as loop
 from improvo.improvement.decision import rule, why_not_better
+from improvo.improvement.folder import Candidate
 from improvo.improvement.improve import Improvement
 from improvo.improvement.progress import ImprovementProgress
+from improvo.improvement.recipe import TrainingJob
+from improvo.improvement.rounds import Rounds
 from improvo.improvement.settings import ImproveSettings, SplitSettings, ValidationSettings
+from improvo.improvement.split import Part
 from improvo.improvement.validation import GapScores, Validation, gain, read_validation, summary
 from improvo.labeling.labeled import read_labels
 
@@ -569,6 +576,33 @@ def test_a_growing_set_starts_from_the_last_weights_and_replays_what_it_had(
     assert not (tmp_path / "other").exists()
     with pytest.raises(ConfigError, match="begun with"):
         run(tmp_path / "more", [hall], FakeTraining(), rounds=1, settings=default)
+
+
+@pytest.mark.parametrize(("recipe", "seed"), [("held", 7), ("metric", 8), ("tracks", 9)])
+def test_a_round_has_the_seed_of_its_recipe(tmp_path: Path, recipe: str, seed: int) -> None:
+    settings = config.from_dict(
+        ImproveSettings,
+        {
+            "recipe": recipe,
+            "held": {"optimiser": {"seed": 7}},
+            "metric": {"seed": 8},
+            "training": {"optimiser": {"seed": 9}},
+        },
+    )
+    seeds: list[int] = []
+
+    def train(job: TrainingJob) -> dict[str, Any]:
+        seeds.append(job.seed)
+        raise InterruptedError
+
+    start = Candidate("start", tmp_path / "start")
+    folder: Any = SimpleNamespace(start=start)
+    rounds = Rounds(folder, settings, train, (), None, None, ImprovementProgress())
+    for number in (1, 2):
+        candidate = Candidate(f"round {number}", tmp_path / f"round-{number}")
+        with pytest.raises(InterruptedError):
+            rounds.train(candidate, number, start, Part((), settings.sequence), ())
+    assert seeds == [seed, seed + 1]
 
 
 def test_what_makes_an_earlier_recording_worse_is_not_better() -> None:
