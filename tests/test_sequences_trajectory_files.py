@@ -158,10 +158,3 @@ def test_what_we_wrote_is_read_in_seconds_whatever_its_steps(tmp_path: Path, ste
     read, notes = read_trajectory_report(tmp_path / "t.txt")
     np.testing.assert_allclose(read.times, times)
     assert notes == ()
-
-
-def test_kitti_cannot_be_written_with_several_segments(tmp_path: Path) -> None:
-    both = Trajectory(trajectory().times, poses(6), np.array([0, 0, 0, 1, 1, 1]))
-    with pytest.raises(InputError, match=r"poses.txt: a KITTI file cannot tell one segment from another; .* TUM"):
-        write_trajectory(tmp_path / "poses.txt", both, "kitti")
-    assert not list(tmp_path.iterdir())

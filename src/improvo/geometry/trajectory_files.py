@@ -101,7 +101,7 @@ def write_trajectory(path: Path | str, trajectory: Trajectory, format: str = "tu
     """Write a trajectory atomically; rows without a pose are left out of TUM files.
 
     A comment line `# segment N: ...` goes before each new segment; `read_trajectory` understands it, others skip it.
-    KITTI files have neither times nor gaps nor segments: every row must have a pose, in one world.
+    KITTI files have neither times nor gaps: every row must have a pose. Nor do they tell one segment from another.
 
     Args:
         path: the file.
@@ -110,15 +110,13 @@ def write_trajectory(path: Path | str, trajectory: Trajectory, format: str = "tu
         unit: of lengths, for the first line of a TUM file.
 
     Raises:
-        InputError: an unknown format, or a gap or several segments in a KITTI file.
+        InputError: an unknown format, or a gap in a KITTI file.
         OutputError: the file cannot be written.
     """
     path = Path(path)
     if format == "kitti":
         if not trajectory.valid.all():
             raise InputError(f"{path}: a KITTI file cannot leave out poses; write a TUM file instead")
-        if len(np.unique(trajectory.segment)) > 1:
-            raise InputError(f"{path}: a KITTI file cannot tell one segment from another; write a TUM file instead")
         rows = (" ".join(f"{value:.12g}" for value in pose[:3].ravel()) for pose in trajectory.world_from_cam)
         write_text(path, "".join(f"{row}\n" for row in rows))
     elif format == "tum":
