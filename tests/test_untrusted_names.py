@@ -36,7 +36,7 @@ from improvo.sequences.mask import size_of
 from improvo.sequences.opening import FORMATS
 from improvo.stability.tables import read_points
 from improvo.untrusted.text import load_json, load_yaml, read_json_file
-from sequence_builders import CAMERA, images, write_images
+from sequence_builders import CAMERA, images, write_images, write_video
 from sequence_encoders import write_r3d
 
 DIGITS = "9" * 5000
@@ -85,6 +85,14 @@ def test_an_output_that_no_system_can_make(tmp_path: Path, name: str) -> None:
 def test_a_name_of_255_bytes_can_be_written(tmp_path: Path) -> None:
     write_text(tmp_path / ("x" * 251 + ".txt"), "y")
     assert [path.read_text() for path in tmp_path.iterdir()] == ["y"]
+
+
+def test_a_video_with_a_name_of_255_bytes_needs_no_longer_one_beside_it(tmp_path: Path) -> None:
+    write_video(tmp_path / "v.avi", images(3))
+    video = (tmp_path / "v.avi").rename(tmp_path / ("x" * 251 + ".avi"))  # its calibration would be x...x.yaml
+    for settings in ({"fov": 60.0}, {"camera": "90,90,47,36"}, {"camera": str(tmp_path)}):
+        (tmp_path / "camera.yaml").write_text(calibration_yaml(CAMERA))
+        assert len(open_sequence(video, **settings)) == 3
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from improvo.errors import InputError
 from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.grey_levels import SAMPLES, Stretch, stretch_of, to_8_bits
-from improvo.sequences.images import decode, file_bytes, is_file
+from improvo.sequences.images import decode, file_bytes
 from improvo.types import UInt8
-from improvo.untrusted.paths import check_is_file, is_text
+from improvo.untrusted.paths import check_is_file, is_file, is_text
 
 _HEAD = 1 << 16  # bytes in which a JPEG's orientation stands
 _FLAGS = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH

@@ -15,7 +15,7 @@ from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.grey_levels import to_8_bits
 from improvo.types import Float32, UInt8
 from improvo.untrusted.limits import MAX_PICTURE_BYTES
-from improvo.untrusted.paths import check_is_file
+from improvo.untrusted.paths import check_is_file, is_file
 from improvo.untrusted.pictures import check_picture
 from improvo.untrusted.text import reason
 
@@ -187,14 +187,6 @@ def listed_file(folder: Path, name: str) -> Path:
     tails = ["/".join(parts[-count:]) for count in (len(parts), 3, 2, 1) if 0 < count <= len(parts)]
     candidates = [folder / name, folder / plain, *(folder / tail for tail in tails)]
     return next((file for file in candidates if is_file(file)), folder / plain)
-
-
-def is_file(path: Path) -> bool:
-    """Whether there is such a file, whatever its name."""
-    try:
-        return path.is_file()
-    except OSError:  # a name that is longer than any can be, or in a folder that may not be looked into
-        return False
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:
