@@ -74,6 +74,9 @@ def test_a_trajectory_has_a_matrix_for_each_time() -> None:
     for poses in (np.zeros((5, 7)), np.zeros((4, 4, 4)), np.zeros((5, 3, 4))):
         with pytest.raises(ValueError, match=r"Trajectory.world_from_cam: shape .* expected \(5, 4, 4\)"):
             improvo.Trajectory(np.arange(5.0), poses)
+    for segment in (np.zeros(4, np.int64), np.zeros(6, np.int64), np.zeros((5, 1), np.int64)):
+        with pytest.raises(ValueError, match=r"Trajectory.segment: shape .* expected \(5,\), a number for each time"):
+            improvo.Trajectory(np.arange(5.0), np.tile(np.eye(4), (5, 1, 1)), segment)
 
 
 def test_a_trajectory_is_evaluated_and_not_what_has_one(orb: improvo.Frontend) -> None:

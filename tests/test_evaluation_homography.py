@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import cv2
@@ -203,3 +204,13 @@ def test_bad_folders_are_one_line_errors(tmp_path: Path) -> None:
     (tmp_path / "v_board" / "H_1_2").write_text("1 0 0")
     with pytest.raises(InputError, match="nine numbers"):
         open_scene(hpatches_scenes(tmp_path)[0], SETTINGS)
+
+
+def test_a_picture_may_have_a_name_that_is_no_text(tmp_path: Path) -> None:
+    """Linux takes any bytes."""
+    picture = cv2.imencode(".png", np.random.default_rng(0).integers(0, 255, (64, 80), np.uint8))[1].tobytes()
+    with open(os.fsencode(tmp_path) + b"/\xff.png", "wb") as file:
+        file.write(picture)
+    (scene,) = picture_scenes(tmp_path)
+    _, views = open_scene(scene, HomographySettings(views=2))
+    assert len(views) == 2

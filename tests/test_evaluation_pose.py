@@ -315,6 +315,13 @@ def test_a_frame_that_cannot_be_decoded_takes_its_pairs_out_and_is_named(tmp_pat
     assert "cannot be decoded (5)" in pose_tables(results(outcome))
 
 
+def test_a_recording_of_which_nothing_can_be_decoded_does_not_spoil_the_next_run(tmp_path: Path) -> None:
+    broken = PlaneSource(unreadable=tuple(range(20)))
+    for _ in range(2):
+        with pytest.raises(InputError, match="gap 3 gives no pairs"):
+            run(tmp_path, PlaneFeatures(), source=broken)
+
+
 @pytest.mark.parametrize(
     ("source", "changes", "message"),
     [

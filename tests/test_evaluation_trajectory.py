@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sequence_encoders as encoders
+from fuzz_targets import scene
 from improvo.errors import ConfigError, InputError
 from improvo.evaluation.settings import TrajectorySettings
 from improvo.evaluation.trajectory.protocol import associate, clean_truth, evaluate_trajectory
@@ -20,6 +22,7 @@ from improvo.evaluation.trajectory.relative import window_pairs
 from improvo.geometry.alignment import Similarity
 from improvo.geometry.se3 import nearest_rotation, rigid, so3_exp
 from improvo.geometry.trajectory_files import read_trajectory
+from improvo.sequences import open_recording
 from improvo.types import Float64, Trajectory
 
 RNG_SEED = 7
@@ -310,12 +313,36 @@ def test_kitti_rows_without_times_count_the_rows_of_a_timed_file(tmp_path: Path)
         estimate, other, notes = read_pair(tmp_path / first, tmp_path / second)
         np.testing.assert_array_equal(estimate.times, other.times)
         assert any("row by row" in note for note in notes)
+        assert not any("10 poses per second" in note for note in notes)
     rows = (tmp_path / "kitti.txt").read_text().splitlines()
     (tmp_path / "kitti.txt").write_text("\n".join(rows[:-1]))
     with pytest.raises(InputError, match=r"kitti.txt: has 100 poses without times, and the other 101; put a times.txt"):
         read_pair(tmp_path / "kitti.txt", tmp_path / "truth.txt")
     (tmp_path / "times.txt").write_text("".join(f"{time}\n" for time in truth.times))
     assert len(read_pair(tmp_path / "kitti.txt", tmp_path / "truth.txt")[0]) == 100
+
+
+def test_what_is_odd_in_kitti_rows_is_told_though_they_count_others(tmp_path: Path) -> None:
+    from improvo.evaluation.trajectory.pair import read_pair
+    from improvo.geometry.trajectory_files import write_trajectory
+
+    truth = wander(5, 20)
+    write_trajectory(tmp_path / "kitti.txt", truth, "kitti")
+    rows = (tmp_path / "kitti.txt").read_text().splitlines()
+    (tmp_path / "kitti.txt").write_text("\n".join([*rows[:7], "lost", *rows[8:]]))
+    estimate, _, notes = read_pair(tmp_path / "kitti.txt", truth)
+    assert np.flatnonzero(~estimate.valid).tolist() == [7]
+    assert any("not numbers (line 8)" in note for note in notes)
+
+
+def test_a_recording_of_one_file_may_be_the_truth(tmp_path: Path) -> None:
+    from improvo.evaluation.trajectory.pair import read_pair
+
+    path = encoders.write_transforms(tmp_path, scene()) / "transforms.json"
+    truth = open_recording(path).ground_truth
+    assert truth is not None
+    _, found, _ = read_pair(truth, path)
+    np.testing.assert_allclose(found.world_from_cam, truth.world_from_cam, rtol=0, atol=1e-12)
 
 
 def test_the_api_holds_the_same_files_against_each_other_as_the_command(

@@ -200,6 +200,32 @@ def test_damaged_models_are_one_line(tmp_path: Path) -> None:
         read_reference(folder)
     with pytest.raises(InputError, match="is no COLMAP model"):
         read_reference(tmp_path)
+    text = write_colmap(tmp_path / "text", [f"{index:06d}.png" for index in KNOWN], binary=False)
+    lines = (text / "images.txt").read_text().splitlines()
+    row = next(number for number, line in enumerate(lines) if line.endswith(".png"))
+    fields = lines[row].split()
+    lines[row] = " ".join([fields[0], "0", "0", "0", "0", *fields[5:]])
+    (text / "images.txt").write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"damaged COLMAP model .a quaternion is zero"):
+        read_reference(text)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "model"),
+    [((0.1, 0.2, 0.0, 0.0, 0.3), "brown"), ((0.1, 0.2, 0.3, 0.4), "fisheye"), ((), "fisheye"), ((0.9,), "fov")],
+)
+def test_a_camera_that_the_file_cannot_hold_is_refused(
+    tmp_path: Path, distortion: tuple[float, ...], model: str
+) -> None:
+    camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, distortion, model)
+    with pytest.raises(InputError, match=r"t.txt: holds k1 k2 p1 p2 of a lens"):
+        write_reference(tmp_path / "t.txt", camera, np.zeros(1, np.int64), np.eye(4)[None])
+    assert not list(tmp_path.iterdir())
+    plain = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, (0.1, 0.2, 0.01, 0.02, 0.0), "brown")
+    write_reference(tmp_path / "t.txt", plain, np.zeros(1, np.int64), np.eye(4)[None])
+    calibration = read_reference(tmp_path / "t.txt").calibration
+    assert calibration is not None
+    assert calibration.distortion == (0.1, 0.2, 0.01, 0.02)
 
 
 def test_a_trajectory_is_measured_against_the_reference(

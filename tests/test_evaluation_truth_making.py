@@ -16,7 +16,7 @@ from rendered_walk import _WALLS, CAMERA, _texture, render_with_depth
 
 from improvo.cli.main import main
 from improvo.errors import ConfigError, InputError
-from improvo.evaluation.truth.make import TruthQuality
+from improvo.evaluation.truth.make import TruthQuality, make_truth
 from improvo.evaluation.truth.metric_scale import scale_from_depth, scale_from_poses
 from improvo.evaluation.truth.motion_check import check_motion
 from improvo.evaluation.truth.reference import read_reference
@@ -27,6 +27,7 @@ from improvo.geometry.alignment import align_points
 from improvo.geometry.camera import Camera
 from improvo.geometry.se3 import inverse, rigid, rotation_angle_deg, so3_exp, transform
 from improvo.geometry.trajectory_files import write_trajectory
+from improvo.sequences import open_sequence
 from improvo.types import Float32, Float64, Trajectory
 
 FRAMES = 16
@@ -173,6 +174,13 @@ def test_masked_pixels_have_no_features(walk: Path, tmp_path: Path) -> None:
     assert len(x) > 300
     assert x.min() > CAMERA.width // 3 + 5  # the border counts as masked
     assert main(given) == 2  # the same working folder with other pixels
+
+
+def test_a_camera_that_stays_must_have_a_place_in_the_file(walk: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    sequence = open_sequence(walk, camera="250,250,159.5,119.5,0.1,-0.02,0,0,0.01")
+    with pytest.raises(InputError, match=r"more distortion than k1 k2 p1 p2.*leave out --calibrate none"):
+        make_truth(sequence, tmp_path / "truth.txt", TruthSettings(calibrate="none"))
 
 
 def test_pairs_are_the_next_images_and_powers_of_two() -> None:

@@ -153,6 +153,19 @@ def test_table_2_compares_both_variants_on_the_same_features(monkeypatch: pytest
     assert CAMERA.width == 160
 
 
+def test_odometry_that_finds_no_pose_is_told_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Blind:
+        name = "blind"
+
+        def __call__(self, image: UInt8) -> Features:
+            return Features(np.zeros((0, 2), np.float32), np.zeros((0, 8), np.float32), np.zeros(0, np.float32))
+
+    monkeypatch.setattr("improvo.evaluation.vo.protocol.load_frontend", lambda name, max_keypoints: Blind())
+    rest = OdometrySettings(), TrajectorySettings(time_windows=(0.5,))
+    (outcome,), _ = evaluate_vo([IterableSource()], [LoadedFrontend("blind")], *rest)  # type: ignore[list-item]
+    assert (outcome.note, outcome.errors, outcome.segments) == ("odometry found no pose", None, [])
+
+
 def test_two_weights_files_of_one_name_need_labels(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 

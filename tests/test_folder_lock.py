@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import socket
 import subprocess
 import sys
 import threading
@@ -117,3 +118,41 @@ def test_temporary_files_of_another_machine_stay_for_a_day(tmp_path: Path) -> No
     os.utime(theirs, (0, 0))
     files.clear_leftovers(tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No locks of the system, none of its calls that Windows lacks, and no open file is removed."""
+    closed: list[int] = []
+    close, unlink = os.close, os.unlink
+
+    def close_noted(descriptor: int) -> None:
+        close(descriptor)
+        closed.append(descriptor)
+
+    def unlink_closed(path: Path) -> None:
+        if not closed:
+            raise PermissionError(13, "The process cannot access the file because it is being used")
+        unlink(path)
+
+    for name in ("pread", "pwrite"):
+        monkeypatch.delattr(os, name, raising=False)
+    monkeypatch.setattr(os, "close", close_noted)
+    monkeypatch.setattr(os, "unlink", unlink_closed)
+    monkeypatch.setattr(folder_lock, "_WINDOWS", True)
+    monkeypatch.setattr(folder_lock, "_lock", lambda descriptor: False)
+    monkeypatch.setattr(folder_lock, "process_exists", lambda process: True)  # it cannot be told
+
+
+@pytest.mark.usefixtures("quick", "windows")
+def test_a_folder_is_locked_and_let_go_on_windows(tmp_path: Path) -> None:
+    with locked(tmp_path):
+        assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getpid()
+    assert not (tmp_path / LOCK).exists()
+
+
+@pytest.mark.usefixtures("quick", "windows")
+def test_what_a_killed_process_left_on_windows_holds_no_folder_for_ever(tmp_path: Path) -> None:
+    (tmp_path / LOCK).write_text(json.dumps({**ELSEWHERE, "host": socket.gethostname()}))
+    with locked(tmp_path):
+        assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getpid()

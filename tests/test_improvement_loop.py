@@ -12,6 +12,8 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,12 +22,18 @@ import yaml
 from rendered_walk import write_walk
 
 from improvement_example import SETTINGS, FakeTraining, run
+from improvo import config
 from improvo.errors import ConfigError, ImprovoError, InputError, OutputError
-from improvo.frontend.weights_files import load_weights
+from improvo.frontend.weights_files import find_weights, load_weights, save_weights
+from improvo.improvement import improve as loop
 from improvo.improvement.decision import rule, why_not_better
+from improvo.improvement.folder import Candidate
 from improvo.improvement.improve import Improvement
 from improvo.improvement.progress import ImprovementProgress
+from improvo.improvement.recipe import TrainingJob
+from improvo.improvement.rounds import Rounds
 from improvo.improvement.settings import ImproveSettings, SplitSettings, ValidationSettings
+from improvo.improvement.split import Part
 from improvo.improvement.validation import GapScores, Validation, gain, read_validation, summary
 from improvo.labeling.labeled import read_labels
 
@@ -573,6 +581,33 @@ def test_a_growing_set_starts_from_the_last_weights_and_replays_what_it_had(
         run(tmp_path / "more", [hall], FakeTraining(), rounds=1, settings=default)
 
 
+@pytest.mark.parametrize(("recipe", "seed"), [("held", 7), ("metric", 8), ("tracks", 9)])
+def test_a_round_has_the_seed_of_its_recipe(tmp_path: Path, recipe: str, seed: int) -> None:
+    settings = config.from_dict(
+        ImproveSettings,
+        {
+            "recipe": recipe,
+            "held": {"optimiser": {"seed": 7}},
+            "metric": {"seed": 8},
+            "training": {"optimiser": {"seed": 9}},
+        },
+    )
+    seeds: list[int] = []
+
+    def train(job: TrainingJob) -> dict[str, Any]:
+        seeds.append(job.seed)
+        raise InterruptedError
+
+    start = Candidate("start", tmp_path / "start")
+    folder: Any = SimpleNamespace(start=start)
+    rounds = Rounds(folder, settings, train, (), None, None, ImprovementProgress())
+    for number in (1, 2):
+        candidate = Candidate(f"round {number}", tmp_path / f"round-{number}")
+        with pytest.raises(InterruptedError):
+            rounds.train(candidate, number, start, Part((), settings.sequence), ())
+    assert seeds == [seed, seed + 1]
+
+
 def test_what_makes_an_earlier_recording_worse_is_not_better() -> None:
     settings = ValidationSettings()
 
@@ -586,3 +621,22 @@ def test_what_makes_an_earlier_recording_worse_is_not_better() -> None:
     assert not is_better(both(0.6, 0.58), start, start, settings)
     assert not is_better(both(0.5, 0.7), start, start, settings)
     assert both(0.6, 0.2).mean("right_8px") == pytest.approx(0.6)
+
+
+@pytest.mark.parametrize("earlier", [False, True])
+def test_the_card_says_the_rule_that_was_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, earlier: bool) -> None:
+    monkeypatch.setattr(loop, "write_report", lambda *rest: None)
+    start = Candidate("start", tmp_path / "start")
+    start.folder.mkdir()
+    weights = load_weights(find_weights("superpoint-small"))
+    save_weights(start.weights, weights.tensors, weights.card)
+    measured = validation([0.5] * 15)
+    if earlier:
+        before = replace(measured.scores[0], recording="before/room", earlier=True)
+        measured = replace(measured, scores=(*measured.scores, before))
+    folder: Any = SimpleNamespace(weights=tmp_path / "weights.safetensors", report=None, finished_rounds=lambda: 0)
+    split: Any = None
+    loop._keep(Improvement(folder.weights, 0, (start,), (measured,)), folder, split, ImproveSettings())
+    said = load_weights(folder.weights).card.metrics["improvement"]["rule"]
+    assert said == rule(ValidationSettings(), earlier)
+    assert ("In no recording of an earlier run" in said) == earlier

@@ -20,8 +20,9 @@ from improvo.improvement.plan import plan_improvement
 from improvo.improvement.plan_sample import measure
 from improvo.improvement.settings import ImproveSettings
 from improvo.labeling import plan as module
+from improvo.labeling.label_sequences import fingerprint
 from improvo.labeling.plan import LabelPlan, plan_labels
-from improvo.labeling.store import DONE, SequenceRecord
+from improvo.labeling.store import DONE, LabelStore, SequenceRecord, finish_sequence
 from improvo.odometry.run_settings import LabelRunSettings, RunSettings
 from improvo.sequences.base import SequenceSettings
 
@@ -84,6 +85,19 @@ def test_samples_are_short_and_of_a_few_recordings(tmp_path: Path, monkeypatch: 
     with pytest.raises(InputError, match="no sample could be labelled; the first: dark"):
         plan_labels([tmp_path / f"{n}" for n in range(9)], LabelRunSettings(), pack=True)
     assert done == [("0", 150, True), ("4", 150, True), ("8", 150, True)]
+
+
+def test_samples_are_kept_in_a_store_without_labels_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is done already would cost nothing, and a plan would say so."""
+    settings = LabelRunSettings()
+    short = replace(settings, sequence=replace(settings.sequence, max_frames=module.SAMPLE_FRAMES))
+    store = LabelStore(tmp_path / "labels", fingerprint(short, pack=False), kind=type(short))
+    store.partial("sample-0").mkdir()
+    finish_sequence(store.folder, SequenceRecord("sample-0", str(tmp_path), DONE))
+    monkeypatch.setattr(module, "_lengths", lambda paths, settings: dict.fromkeys(paths, 60))
+    with pytest.raises(InputError, match=r"labels: has labels already; give a new folder"):
+        plan_labels([tmp_path], settings, folder=tmp_path / "labels")
+    assert (tmp_path / "labels" / "sample-0").is_dir()
 
 
 def test_more_recordings_are_sampled_where_they_are_short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -107,6 +107,23 @@ def test_names_are_unique_and_the_same_each_time(tmp_path):
         sequence_names([paths[0], paths[1].parent / ".." / "one" / "rgb"])
 
 
+def test_names_differ_where_a_file_system_knows_no_case(tmp_path):
+    for name in ("one/Walk", "two/walk", "three/WALK"):
+        (tmp_path / name).mkdir(parents=True)
+    first, second, third = (tmp_path / name for name in ("one/Walk", "two/walk", "three/WALK"))
+    assert list(sequence_names([first, second])) == ["Walk", "two-walk"]
+    stored = [SequenceRecord("Walk", str(first), DONE)]
+    assert sequence_names([third, first], stored) == {"three-WALK": third, "Walk": first}
+
+
+def test_a_recording_may_be_called_as_what_is_in_work(tmp_path):
+    store = LabelStore(tmp_path / "labels", SETTINGS)
+    finish(store, "walk.partial")
+    store.partial("attic").mkdir()
+    (tmp_path / "labels" / ".attic.partial" / "label.json").write_text("{}")  # of a killed run
+    assert [record.name for record in store.records()] == ["walk.partial"]
+
+
 def test_recordings_of_a_store_keep_their_names_in_any_list(tmp_path):
     """Many recordings are folders named `images`; a store grows by some of them at a time."""
     folders = [tmp_path / name / "images" for name in ("a", "b", "c")]

@@ -132,6 +132,15 @@ def test_what_is_in_a_recording_is_told_wherever_it_lies(tmp_path: Path) -> None
     assert videos[0] == videos[1] != videos[2]
 
 
+def test_what_is_in_the_pictures_of_a_list_counts_with_the_list(tmp_path: Path) -> None:
+    file = encoders.write_transforms(tmp_path, scene(FRAMES)) / "transforms.json"
+    before = content_of(open_recording(file))
+    assert content_of(open_recording(file)) == before
+    picture = open_recording(file).source(FRAMES // 2)
+    cv2.imwrite(picture, 255 - cv2.imread(picture))
+    assert content_of(open_recording(file)) != before
+
+
 def test_depth_is_told_beside_the_pictures(tmp_path: Path) -> None:
     encoders.write_tum(tmp_path / "room", scene(FRAMES))
     shutil.copytree(tmp_path / "room", tmp_path / "copy")

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,7 +17,7 @@ import ros_encoders
 import sequence_encoders as encoders
 from improvo.errors import ImprovoError, InputError
 from improvo.sequences import open_sequence
-from sequence_builders import CAMERA, depths, images, poses
+from sequence_builders import CAMERA, depths, images, poses, write_images
 from sequence_encoders import Scene
 
 COUNT = 5
@@ -229,6 +230,20 @@ def test_euroc_tables_with_bad_rows(tmp_path: Path) -> None:
     assert "1 rows repeat" in notes
 
 
+def test_euroc_stamps_beyond_64_bits_are_bad_rows(tmp_path: Path) -> None:
+    encoders.write_euroc(tmp_path, scene(), np.eye(4))
+    table = tmp_path / "mav0" / "cam0" / "data.csv"
+    rows = table.read_text().splitlines()
+    late = f"{2**63},{rows[2].split(',')[1]}"
+    table.write_text("\n".join([*rows[:2], late, *rows[3:]]))
+    sequence = open_sequence(tmp_path)
+    assert len(sequence) == COUNT - 1
+    assert any("1 rows are not" in note for note in sequence.notes)
+    table.unlink()  # the names of the files are the stamps
+    write_images(table.with_name("data"), images(1), f"{2**63}.png")
+    assert len(open_sequence(tmp_path)) == COUNT
+
+
 def test_euroc_with_a_transform_that_is_none(tmp_path: Path) -> None:
     encoders.write_euroc(tmp_path, scene(), np.eye(4))
     sensor = tmp_path / "mav0" / "cam0" / "sensor.yaml"
@@ -265,3 +280,22 @@ def test_polycam_images_without_camera_are_left_out_and_counted(tmp_path: Path) 
     sequence = open_sequence(folder)
     assert len(sequence) == COUNT - 1
     assert any("1 of 5 images have no camera file" in note for note in sequence.notes)
+
+
+def test_a_phone_that_claims_pictures_of_no_size_has_no_depth(tmp_path: Path) -> None:
+    folder = encoders.write_polycam(tmp_path, scene())
+    for file in (folder / "keyframes" / "cameras").iterdir():
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"width": 2e9, "height": 2e9}))
+    depth = folder / "keyframes" / "depth"
+    for file in depth.iterdir():
+        assert cv2.imwrite(str(file), np.full((4, 4), 1000, np.uint16))
+    assert open_sequence(folder, fov=60.0).depth(0) is None
+
+
+def test_a_scannet_scene_with_other_pictures_beside_its_frames(tmp_path: Path) -> None:
+    write_images(tmp_path, images(2), "frame-{:06d}.color.png")
+    write_images(tmp_path, images(1), "abcdef{}.color.png")
+    K = " ".join(map(str, np.diag([90.0, 90.0, 1.0, 1.0]).ravel()))
+    (tmp_path / "_info.txt").write_text(f"m_colorWidth = 96\nm_colorHeight = 72\nm_calibrationColorIntrinsic = {K}\n")
+    sequence = open_sequence(tmp_path)
+    assert (sequence.format, len(sequence)) == ("scannet", 2)

@@ -111,6 +111,22 @@ def test_icl_nuim_reflects_the_published_poses(tmp_path: Path) -> None:
     np.testing.assert_allclose(sequence.ground_truth.world_from_cam[1:], expected.poses[1:], atol=1e-9)
 
 
+def test_icl_nuim_numbers_of_a_thinned_copy_are_frames_and_no_milliseconds(tmp_path: Path) -> None:
+    camera = Camera(640, 480, 481.2, 480.0, 319.5, 239.5)
+    expected = Scene(camera, np.arange(3) / 30, images(3, camera), depths(3, camera), poses(3))
+    folder = encoders.write_icl(tmp_path, expected)
+    for file, columns in ((next(folder.glob("*.gt.freiburg")), (0,)), (folder / "associations.txt", (0, 2))):
+        rows = [line.split() for line in file.read_text().splitlines()]
+        for row in rows:
+            for column in columns:
+                row[column] = str(10 * int(row[column]))
+        file.write_text("\n".join(" ".join(row) for row in rows))
+    sequence = open_sequence(folder)
+    np.testing.assert_allclose(sequence.times, 10 * expected.times)
+    assert sequence.ground_truth is not None
+    np.testing.assert_allclose(sequence.ground_truth.world_from_cam[1:], expected.poses[1:], atol=1e-9)
+
+
 @pytest.mark.parametrize(
     "first", ["1 0 0 -2.25 0 0 0 1", "0 0 0 -2.5 0 0 0 1", "1 0 0 2.25 0 0 0 1", "1.5 0 0 -2.25 0 0 0 1"]
 )

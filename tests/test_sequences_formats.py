@@ -96,6 +96,18 @@ def test_seven_scenes(tmp_path: Path) -> None:
     np.testing.assert_allclose(sequence.ground_truth.world_from_cam, poses(COUNT), atol=1e-9)
 
 
+def test_seven_scenes_pictures_of_one_number_are_chosen_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("frame-000000.color.jpg", "frame-000000.color.png", "frame-000001.color.png"):
+        write_images(tmp_path, images(1), name)
+    listed = list(tmp_path.iterdir())
+    for order in (sorted(listed), sorted(listed, reverse=True)):  # a file system lists files in any order
+        monkeypatch.setattr(Path, "iterdir", lambda self, order=order: iter(order))
+        recording = open_recording(tmp_path)
+        assert [Path(recording.source(row)).suffix for row in range(2)] == [".png", ".png"]
+
+
 @pytest.mark.parametrize("number", [0, 2])
 def test_kitti_uses_the_projection_of_its_camera(tmp_path: Path, number: int) -> None:
     folder = tmp_path / "sequences" / "04"
@@ -117,6 +129,24 @@ def test_kitti_uses_the_projection_of_its_camera(tmp_path: Path, number: int) ->
     assert all((frame.image == image).all() for frame, image in zip(sequence, images(COUNT), strict=True))
     assert sequence.ground_truth is not None
     np.testing.assert_allclose(sequence.ground_truth.world_from_cam, poses(COUNT) @ inverse(cam_from_cam0), atol=1e-9)
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_kitti_pictures_that_are_missing_shift_no_other(tmp_path: Path, timed: bool) -> None:
+    pictures, there = images(COUNT), [1, 2, *range(4, COUNT)]
+    for number in there:
+        write_images(tmp_path / "image_0", [pictures[number]], f"{number:06d}.png")
+    np.savetxt(tmp_path / "calib.txt", [(CAMERA.K @ np.eye(4)[:3]).ravel()])
+    np.savetxt(tmp_path / "poses.txt", poses(COUNT)[:, :3].reshape(COUNT, 12))
+    step = 0.25 if timed else 0.1
+    if timed:
+        (tmp_path / "times.txt").write_text("".join(f"{step * i}\n" for i in range(COUNT)))
+    sequence = open_sequence(tmp_path)
+    np.testing.assert_allclose(sequence.times, step * np.array(there))
+    assert all((frame.image == pictures[number]).all() for frame, number in zip(sequence, there, strict=True))
+    assert sequence.ground_truth is not None
+    np.testing.assert_allclose(sequence.ground_truth.world_from_cam, poses(COUNT)[there], atol=1e-9)
+    assert sequence.notes == ((f"{tmp_path}: 2 of {COUNT} images are missing",) if timed else ())
 
 
 @pytest.mark.parametrize("folder", ["image_l", "image_r", "image_0"])

@@ -7,7 +7,7 @@ import http.server
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -151,3 +151,20 @@ def test_a_folder_named_by_a_number_is_a_folder(tmp_path: Path, monkeypatch: pyt
     write_images(tmp_path / "07", images(3))
     monkeypatch.chdir(tmp_path)
     assert open_sequence("07", fov=60.0).format == "images"
+
+
+def test_the_first_frame_keeps_its_number_however_late_it_is_taken(camera: FakeCamera) -> None:
+    sequence = open_sequence("0", fov=60.0, stride=2)
+    time.sleep(0.15)  # loading a frontend takes longer
+    frames = [(frame.source_index, int(frame.image[0, 0])) for frame in sequence]
+    assert frames[0] == (0, 0)
+    assert all(number == pixel for number, pixel in frames)
+
+
+@pytest.mark.parametrize("kind", [PurePosixPath, PureWindowsPath])
+def test_an_address_that_went_through_a_path_is_still_one(kind: type[PurePath]) -> None:
+    for address in ("rtsp://cam:554/stream/1", "HTTP://10.0.0.1:8080/video?fps=5"):
+        path = str(kind(address))
+        assert live.is_live(path)
+        assert live._address(path) == address
+    assert not live.is_live("C:\\videos\\walk.mp4")

@@ -107,6 +107,16 @@ def test_orientation_of_all_is_applied_and_of_some_is_not(tmp_path: Path) -> Non
     assert any("1 of 4 pictures note another rotation" in note for note in sequence.notes)
 
 
+def test_a_missing_or_empty_picture_does_not_turn_the_others_back(tmp_path: Path) -> None:
+    turned = {f"{i}.jpg": with_orientation(encoded(".jpg", p), 6) for i, p in enumerate(images(4))}
+    folder = write(tmp_path / "s", {**turned, "2.jpg": b""})
+    (folder / "rgb.txt").write_text("".join(f"{i}.5 {i}.jpg\n" for i in range(5)))  # there is no 4.jpg
+    for format in ("images", "tum"):
+        sequence = open_sequence(folder, fov=FOV, format=format)
+        assert [frame.image.shape for frame in sequence] == [(CAMERA.width, CAMERA.height)] * 3
+        assert not any("rotation" in note for note in sequence.notes)
+
+
 @pytest.mark.parametrize(
     ("wanted", "other"),
     [

@@ -239,3 +239,49 @@ def test_kitti_raw_drive(tmp_path: Path) -> None:
     np.testing.assert_allclose(moved[:3, 3], [step, 0, 1], atol=1e-6)
     with pytest.raises(InputError, match="--topic can be image_02"):
         open_sequence(drive, topic="image_05")
+
+
+def test_pictures_of_an_extracted_drive_have_the_poses_of_the_camera_as_it_was_built_in(tmp_path: Path) -> None:
+    cam_from_cam0 = rigid(so3_exp(np.array([0.01, 0.02, -0.015])), np.array([0.06, 0.001, 0.002]))
+    cam_from_imu = rigid(so3_exp(np.array([0.3, -1.2, 0.4])), np.array([0.1, 0.2, -0.3]))
+    day = tmp_path / "2011_09_26"
+    drive = write_drive(day, np.array([[90.0, 0, 47, 9], [0, 91, 36.5, 0], [0, 0, 1, 0]]), cam_from_imu)
+    turn, place = (" ".join(map(repr, part.ravel().tolist())) for part in (cam_from_cam0[:3, :3], cam_from_cam0[:3, 3]))
+    calibration = day / "calib_cam_to_cam.txt"
+    rectified = open_sequence(drive).ground_truth
+    assert rectified is not None
+    # the other way round: 96x72 is now the size of the pictures that are not rectified
+    text = calibration.read_text().replace("S_rect_02: 96 72", "S_rect_02: 90 70").replace("S_02: 100", "S_02: 96")
+    text = text.replace("S_02: 96 80", "S_02: 96 72")
+    calibration.write_text(f"{text}R_02: {turn}\nT_02: {place}\n")
+    sequence = open_sequence(drive)
+    assert sequence.raw_camera.distortion[:2] == (-0.3, 0.1)
+    truth = sequence.ground_truth
+    assert truth is not None
+    shift = rigid(np.eye(3), np.array([0.1, 0, 0]))
+    np.testing.assert_allclose(
+        truth.world_from_cam @ cam_from_cam0, rectified.world_from_cam @ shift, rtol=0, atol=1e-9
+    )
+
+
+def test_a_damaged_first_row_of_the_inertial_unit_costs_that_pose_alone(tmp_path: Path) -> None:
+    drive = write_drive(tmp_path / "day", np.array([[90.0, 0, 47, 0], [0, 91, 36.5, 0], [0, 0, 1, 0]]), np.eye(4))
+    whole = open_sequence(drive).ground_truth
+    assert whole is not None
+    (drive / "oxts" / "data" / f"{0:010d}.txt").write_text("")
+    truth = open_sequence(drive).ground_truth
+    assert truth is not None
+    assert truth.valid.tolist() == [False, *[True] * (COUNT - 1)]
+    # positions count from the first place that is known
+    moved = whole.camera_centers[1:] - whole.camera_centers[1]
+    np.testing.assert_allclose(truth.camera_centers[1:] - truth.camera_centers[1], moved, rtol=0, atol=1e-6)
+
+
+def test_true_poses_without_times_follow_the_pictures_at_any_rate(tmp_path: Path) -> None:
+    path = folder(tmp_path / "s", "".join(f"{0.1 * i}\n" for i in range(COUNT)))
+    np.savetxt(path / "groundtruth.txt", poses(COUNT)[:, :3].reshape(COUNT, 12))
+    for settings in ({}, {"fps": 20.0}):
+        sequence = open_sequence(path, fov=60.0, **settings)
+        np.testing.assert_allclose(sequence.times, np.arange(COUNT) * (0.05 if settings else 0.1))
+        assert sequence.ground_truth is not None
+        np.testing.assert_allclose(sequence.ground_truth.world_from_cam, poses(COUNT), rtol=0, atol=1e-9)

@@ -148,3 +148,13 @@ def test_kitti_cannot_be_written_with_gaps(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="TUM"):
         write_trajectory(tmp_path / "poses.txt", gap, "kitti")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("step", [1.0, 10.0, 5000.0])
+def test_what_we_wrote_is_read_in_seconds_whatever_its_steps(tmp_path: Path, step: float) -> None:
+    """Frames of a time lapse are a whole number of seconds apart, which in other files would be milliseconds."""
+    times = step * np.arange(4)
+    write_trajectory(tmp_path / "t.txt", Trajectory(times, poses(4)))
+    read, notes = read_trajectory_report(tmp_path / "t.txt")
+    np.testing.assert_allclose(read.times, times)
+    assert notes == ()

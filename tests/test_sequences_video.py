@@ -195,3 +195,11 @@ def test_a_codec_that_cannot_be_decoded_is_named(tmp_path: Path, name: str, cont
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=rf"{name}: its codec, {codec}.*ffmpeg -i {name}"):
         open_sequence(tmp_path / name, fov=60.0)
+
+
+def test_what_is_painted_on_a_picture_in_colour_is_not_in_the_next_one(tmp_path: Path) -> None:
+    write_video(tmp_path / "v.avi", images(3))
+    sequence = open_sequence(tmp_path / "v.avi", fov=60.0)
+    image = sequence[1].image.copy()
+    sequence.colour(1)[:] = 0
+    np.testing.assert_array_equal(sequence[1].image, image)

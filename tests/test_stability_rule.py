@@ -152,5 +152,14 @@ def test_arrays_that_would_give_wrong_labels_are_refused(change: Any, words: str
         label_stability(*change(*simulated_tracks()))
 
 
+def test_map_points_that_are_not_one_for_each_track_are_refused():
+    tracks, *rest = simulated_tracks()
+    count = len(np.unique(tracks.track))
+    assert label_stability(tracks, *rest, point=np.arange(count)).point.tolist() == list(range(count))
+    for wrong in (count - 1, count + 1, len(tracks)):
+        with pytest.raises(ValueError, match=rf"point: shape \({wrong},\), expected \({count},\)"):
+            label_stability(tracks, *rest, point=np.arange(wrong))
+
+
 def tracks_of(tracks: Tracks, rows: Any) -> Tracks:
     return Tracks(tracks.frame[rows], tracks.track[rows], tracks.keypoints[rows], tracks.weight[rows])

@@ -30,12 +30,13 @@ from improvo.odometry.run.run_folder import RunFolder
 from improvo.odometry.run_settings import RunSettings
 from improvo.sequences import SequenceSettings, open_sequence
 from improvo.sequences.base import UnreadableFrameError
+from improvo.sequences.given_files import mask_content
 from improvo.sequences.images import natural_key, read_image
 from improvo.sequences.mask import size_of
 from improvo.sequences.opening import FORMATS
 from improvo.stability.tables import read_points
 from improvo.untrusted.text import load_json, load_yaml, read_json_file
-from sequence_builders import CAMERA, images, write_images
+from sequence_builders import CAMERA, images, write_images, write_video
 from sequence_encoders import write_r3d
 
 DIGITS = "9" * 5000
@@ -86,6 +87,14 @@ def test_a_name_of_255_bytes_can_be_written(tmp_path: Path) -> None:
     assert [path.read_text() for path in tmp_path.iterdir()] == ["y"]
 
 
+def test_a_video_with_a_name_of_255_bytes_needs_no_longer_one_beside_it(tmp_path: Path) -> None:
+    write_video(tmp_path / "v.avi", images(3))
+    video = (tmp_path / "v.avi").rename(tmp_path / ("x" * 251 + ".avi"))  # its calibration would be x...x.yaml
+    for settings in ({"fov": 60.0}, {"camera": "90,90,47,36"}, {"camera": str(tmp_path)}):
+        (tmp_path / "camera.yaml").write_text(calibration_yaml(CAMERA))
+        assert len(open_sequence(video, **settings)) == 3
+
+
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 def test_names_with_odd_digits(tmp_path: Path, suffix: str) -> None:
     pictures = images(6)
@@ -102,9 +111,20 @@ def test_names_with_odd_digits(tmp_path: Path, suffix: str) -> None:
 
 def test_natural_order_of_any_numbers() -> None:
     names = ["a1", "a2", "a02", "a10", "a1²3", "b", "a" + DIGITS, "a" + "9" * 4000]
-    ordered = sorted(names, key=natural_key)
-    assert ordered[:2] == ["a1", "a1²3"]
+    ordered, otherwise = sorted(names, key=natural_key), names[::-1]
+    otherwise.sort(key=natural_key)
+    assert ordered == otherwise  # also of numbers that are the same
+    assert ordered[:4] == ["a1", "a1²3", "a02", "a2"]
     assert ordered.index("a2") < ordered.index("a10") < ordered.index("a" + "9" * 4000) < ordered.index("a" + DIGITS)
+
+
+def test_a_mask_whose_name_is_no_text(tmp_path: Path) -> None:
+    with open(os.fsencode(tmp_path) + b"/\xff.png", "wb") as file:
+        file.write(b"white")
+    before = mask_content(SequenceSettings(mask=str(tmp_path)))
+    os.rename(os.fsencode(tmp_path) + b"/\xff.png", os.fsencode(tmp_path) + b"/\xfe.png")
+    assert before.startswith("sha256:")
+    assert mask_content(SequenceSettings(mask=str(tmp_path))) != before
 
 
 def test_a_file_whose_name_is_no_text(tmp_path: Path) -> None:

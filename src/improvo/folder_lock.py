@@ -29,6 +29,7 @@ _BEAT_SECONDS = 5.0
 _PATIENCE_SECONDS = 75.0  # without a beat, after which a holder elsewhere is dead; NFS shows old times for a minute
 _LONGEST = 1000  # bytes of a lock file
 _SOMEBODY = "another process"
+_WINDOWS = os.name == "nt"
 _held: dict[Path, int] = {}  # lock file -> the thread of this process that holds it
 _guard = threading.Lock()
 
@@ -160,9 +161,15 @@ class _LockFile:
         """Let go; the file vanishes before somebody else can have it."""
         self._released.set()
         with suppress(OSError):
-            os.unlink(self._file)
+            if _WINDOWS:  # removes no open file: one that somebody else has opened stays, and names nobody
+                os.ftruncate(self._descriptor, 0)
+            else:
+                os.unlink(self._file)
         with suppress(OSError):
             os.close(self._descriptor)
+        if _WINDOWS:
+            with suppress(OSError):
+                os.unlink(self._file)
 
     def _opened(self) -> int:
         """The file, locked by the system where it can; never one that its holder has removed meanwhile."""
@@ -184,7 +191,8 @@ class _LockFile:
         if before and not self._is_gone(before):
             raise BusyError(self._what, _words(before))
         os.ftruncate(self._descriptor, 0)
-        os.pwrite(self._descriptor, json.dumps(self._mine).encode(), 0)
+        os.lseek(self._descriptor, 0, os.SEEK_SET)
+        os.write(self._descriptor, json.dumps(self._mine).encode())
         if not self._by_system:  # two that begin at once both come here; the last one to write has it
             time.sleep(1.0)
             if (now := self._content()) != self._mine:
@@ -192,11 +200,11 @@ class _LockFile:
 
     def _content(self) -> dict[str, Any]:
         """What stands in the file. To open and close it once more would give the system's lock away."""
-        return holder_in(os.pread(self._descriptor, _LONGEST, 0))
+        return _holder_by(self._descriptor)
 
     def _is_gone(self, holder: dict[str, Any]) -> bool:
-        """Whether the process that the file names is dead, or somewhere else without a beat."""
-        if holder.get("host") == socket.gethostname():
+        """Whether the process that the file names is dead, or somewhere else, or on Windows, without a beat."""
+        if holder.get("host") == socket.gethostname() and not _WINDOWS:  # which does not say what runs
             return self._by_system or not _is_running(holder.get("process"))
         ends = time.monotonic() + _PATIENCE_SECONDS
         beat = os.stat(self._file).st_mtime_ns
@@ -236,7 +244,7 @@ def _seems_held_here(file: Path) -> bool:
         return True
     try:
         by_system = _lock(descriptor)
-        holder = holder_in(os.pread(descriptor, _LONGEST, 0))
+        holder = _holder_by(descriptor)
     except BlockingIOError:
         return True
     finally:
@@ -256,6 +264,12 @@ def holder_of(file: Path) -> str:
     except OSError:
         found = locations.claimant(file) or {}
     return _words(found) if found else ""
+
+
+def _holder_by(descriptor: int) -> dict[str, Any]:
+    """Who stands in an open lock file."""
+    os.lseek(descriptor, 0, os.SEEK_SET)  # Windows has no `os.pread`
+    return holder_in(os.read(descriptor, _LONGEST))
 
 
 def _lock(descriptor: int) -> bool:

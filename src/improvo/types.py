@@ -82,7 +82,7 @@ class Trajectory:
     Poses of one segment share a world frame and a scale; those of different segments do not.
 
     Raises:
-        ValueError: another number of poses than of times, or poses that are not 4x4 matrices.
+        ValueError: another number of poses or segments than of times, or poses that are not 4x4 matrices.
     """
 
     times: Float64  # (N,) seconds, increasing
@@ -93,6 +93,9 @@ class Trajectory:
         if np.shape(self.world_from_cam) != (len(self.times), 4, 4):
             shape, wanted = np.shape(self.world_from_cam), (len(self.times), 4, 4)
             raise ValueError(f"Trajectory.world_from_cam: shape {shape}, expected {wanted}, a matrix for each time")
+        if np.shape(self.segment) not in ((0,), (len(self.times),)):
+            shape, rows = np.shape(self.segment), (len(self.times),)
+            raise ValueError(f"Trajectory.segment: shape {shape}, expected {rows}, a number for each time")
         if len(self.segment) != len(self.times):
             object.__setattr__(self, "segment", np.where(self.valid, 0, -1).astype(np.int64))
 

@@ -262,7 +262,7 @@ class PoseAccuracy:
     """A cell of Table 1: how often the relative pose of two images is right."""
 
     frontend: str
-    estimator: str  # the solver: opencv or poselib
+    estimator: str  # the solver: opencv, poselib or usac
     gap: int  # frames between the two images
     pairs: int
     rotation_success: float  # share of the pairs with less than the largest rotation error (5 degrees)

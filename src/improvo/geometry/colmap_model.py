@@ -77,6 +77,7 @@ def read_colmap_model(folder: Path) -> ColmapModel:
         images = _binary_images(folder) if binary else _text_images(folder)
         names, camera_ids, quat_xyzw, translation = zip(*sorted(images), strict=True) if images else ((), (), (), ())
         calibrations = tuple(cameras[camera] for camera in camera_ids)
+        rotation = rotation_from_quat_xyzw(np.array(quat_xyzw).reshape(-1, 4))
     except OSError as error:
         raise InputError(
             f"{error.filename}: cannot be read ({error.strerror}); export the COLMAP model again"
@@ -85,7 +86,6 @@ def read_colmap_model(folder: Path) -> ColmapModel:
         raise InputError(f"{folder}: is a damaged COLMAP model ({error}); export it again") from None
     if not names:
         raise InputError(f"{folder}: has no registered image; give a model with poses")
-    rotation = rotation_from_quat_xyzw(np.array(quat_xyzw))
     return ColmapModel(folder, tuple(names), rigid(rotation, np.array(translation)), calibrations)
 
 

@@ -24,9 +24,11 @@ from improvo.types import Float64, Int64, Trajectory
 from improvo.untrusted.text import is_number
 
 RIGID_TOLERANCE = 1e-2
+NO_TIMES = "has no times; 10 poses per second assumed, as in KITTI"
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*(,\d+)?([eE][+-]?\d+)?")
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")
 _TUM_HEADER = "# camera-to-world, {}: timestamp tx ty tz qx qy qz qw\n"
+_OWN_HEADER = _TUM_HEADER.partition("{")[0]
 _EUROC_NAMES = re.compile(r"^#?\s*timestamp\s*\[ns\]", re.IGNORECASE)
 _SEGMENT_COMMENT = re.compile(r"#\s*segment\s+(\d+)\s*(?::|$)")
 
@@ -37,7 +39,7 @@ def read_trajectory(path: Path | str, format: str = "auto", times: Float64 | Non
 
 
 def read_trajectory_report(
-    path: Path | str, format: str = "auto", times: Float64 | None = None
+    path: Path | str, format: str = "auto", times: Float64 | None = None, numbered: bool = False
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """The trajectory of a TUM, KITTI or EuRoC file, and one line for each kind of problem in it.
 
@@ -45,6 +47,7 @@ def read_trajectory_report(
         path: the file.
         format: `tum`, `kitti`, `euroc`, or `auto` to tell by the columns.
         times: seconds, for KITTI's rows, which have none; without it `times.txt` beside the file, or 10 Hz.
+        numbered: the first column of a TUM file is a number of frames: taken as it stands, whatever its size.
 
     Returns:
         The trajectory, sorted by time, bad rows NaN; and the problems.
@@ -70,7 +73,11 @@ def read_trajectory_report(
             raise InputError(f"{path}: has {len(values)} poses but there are {len(stamps)} times; remove what is extra")
         stamps = stamps[: len(values)]
     else:
-        stamps, unit = (values[:, 0] * 1e-9, None) if format == "euroc" else in_seconds(values[:, 0])
+        stamps, unit = values[:, 0], None
+        if format == "euroc":
+            stamps = stamps * 1e-9
+        elif not numbered and not lines[0].startswith(_OWN_HEADER):  # what we write is in seconds
+            stamps, unit = in_seconds(stamps)
         problems += (note_of(unit),) if unit else ()
         w_first = (_quaternion_order(lines) or ("wxyz" if format == "euroc" else "xyzw")) == "wxyz"
         quat_xyzw = values[:, [5, 6, 7, 4]] if w_first else values[:, 4:8]
@@ -94,7 +101,7 @@ def write_trajectory(path: Path | str, trajectory: Trajectory, format: str = "tu
     """Write a trajectory atomically; rows without a pose are left out of TUM files.
 
     A comment line `# segment N: ...` goes before each new segment; `read_trajectory` understands it, others skip it.
-    KITTI files have neither times nor gaps: every row must have a pose.
+    KITTI files have neither times nor gaps: every row must have a pose. Nor do they tell one segment from another.
 
     Args:
         path: the file.
@@ -264,12 +271,17 @@ def _from_quaternions(quat_xyzw: Float64, translation: Float64) -> Float64:
     return rigid(rotation, translation)
 
 
-def has_times(path: Path) -> bool:
-    """Whether the rows of a trajectory file have times: KITTI's have none, unless a `times.txt` beside it fits."""
+def has_times(path: Path, beside: bool = True) -> bool:
+    """Whether the rows of a trajectory file have times: KITTI's have none, unless a `times.txt` beside it fits.
+
+    Args:
+        path: of the file.
+        beside: whether a `times.txt` counts.
+    """
     lines = read_text(path, "a trajectory", "give a TUM, KITTI or EuRoC file").splitlines()
     if _guess(lines, path) != "kitti":
         return True
-    return not _kitti_times(path, len(_rows(lines, 12, all_count=True)[0]))[1]
+    return beside and not _kitti_times(path, len(_rows(lines, 12, all_count=True)[0]))[1]
 
 
 def _kitti_times(path: Path, count: int) -> tuple[Float64, tuple[str, ...]]:
@@ -279,7 +291,7 @@ def _kitti_times(path: Path, count: int) -> tuple[Float64, tuple[str, ...]]:
         times = read_times(beside)[0]
         if len(times) >= count:
             return times[:count], ()
-    return np.arange(count) / 10.0, ("has no times; 10 poses per second assumed, as in KITTI",)
+    return np.arange(count) / 10.0, (NO_TIMES,)
 
 
 def read_times(path: Path) -> tuple[Float64, tuple[str, ...]]:

@@ -170,7 +170,8 @@ def _keep(result: Improvement, folder: ImproveFolder, split: Split, settings: Im
         return
     best, validation = result.candidates[result.best], result.validations[result.best]
     measures = summary(validation, result.validations[0], settings.validation)
-    _publish(best, folder.weights, rule(settings.validation), measures)
+    words = rule(settings.validation, bool(result.validations[0].earlier))
+    _publish(best, folder.weights, words, measures)
     judged = result.candidates, result.validations, result.faults
     write_report(folder.report, *judged, result.best, split, settings, result.control)
 

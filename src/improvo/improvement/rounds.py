@@ -27,7 +27,7 @@ from improvo.improvement.reference import (
     reference_parts,
     refuse_without_depth,
 )
-from improvo.improvement.settings import TRACKS, ImproveSettings, SplitSettings
+from improvo.improvement.settings import METRIC, TRACKS, ImproveSettings, SplitSettings
 from improvo.improvement.split import (
     Part,
     Split,
@@ -169,7 +169,8 @@ class Rounds:
         candidate.folder.mkdir(exist_ok=True)
         settings = self._settings
         start = self._folder.start
-        seed = (settings.training if settings.recipe == TRACKS else settings.held).optimiser.seed
+        seeds = {TRACKS: settings.training.optimiser.seed, METRIC: settings.metric.seed}
+        seed = seeds.get(settings.recipe, settings.held.optimiser.seed)
         job = TrainingJob(
             settings,
             seed + number - 1,  # another try from the same weights and labels must not be the same try

@@ -88,10 +88,10 @@ def plan_labels(
         settings: of the odometry and the labels.
         pack: whether the frames are kept beside the labels.
         on_frames: is told the number of further frames of the sample processed.
-        folder: label store to keep the samples in; nothing is kept if None.
+        folder: label store to keep the samples in, without any labels yet; nothing is kept if None.
 
     Raises:
-        InputError: none of the samples could be labelled.
+        InputError: none of the samples could be labelled, or the store has labels already, which cost nothing again.
     """
     lengths = _lengths(paths, settings)
     if not lengths:
@@ -111,7 +111,10 @@ def plan_labels(
             failures.append(result)
 
     with tempfile.TemporaryDirectory(prefix="improvo-plan-") as temporary:
-        store = LabelStore(folder or Path(temporary), fingerprint(short, pack), kind=type(short)).folder
+        kept = LabelStore(folder or Path(temporary), fingerprint(short, pack), kind=type(short))
+        if kept.records():
+            raise InputError(f"{folder}: has labels already; give a new folder for the samples of a plan")
+        store = kept.folder
         jobs = [LabelJob(f"sample-{row}", path, store, short, pack) for row, path in enumerate(chosen)]
         run_in_processes(_sampled, jobs, on_result, on_frames, 1)
     if not samples:

@@ -250,7 +250,7 @@ def read_records(folder: Path) -> list[SequenceRecord]:
     files = [*folder.glob(f"*/{RECORD_FILE}"), *folder.glob(".*.failed.json")]
     records: dict[str, SequenceRecord] = {}
     for file in files:
-        if file.parent.name.endswith(".partial"):
+        if file.parent.name.startswith("."):  # in work; no sequence has a name like that
             continue
         record = _read_record(file)
         records.setdefault(record.name, record)  # labels come before an older failure of the same sequence
@@ -282,6 +282,8 @@ def _read_record(file: Path) -> SequenceRecord:
 def sequence_names(paths: list[Path], stored: Iterable[SequenceRecord] = ()) -> dict[str, Path]:
     """A folder name for each recording: that of its record, else one of its own that no other recording has.
 
+    Names differ by more than the case of letters, which some file systems do not tell apart.
+
     Args:
         paths: of the recordings; the same list gives the same names.
         stored: records of the store that they go to, whatever list they were named in.
@@ -290,8 +292,9 @@ def sequence_names(paths: list[Path], stored: Iterable[SequenceRecord] = ()) -> 
         InputError: a recording is named twice, or may be one of the store that has moved.
     """
     by_path = {record.path: record.name for record in stored}
-    taken = {name: path for path, name in by_path.items()}
+    taken = {name.casefold(): path for path, name in by_path.items()}
     names: dict[str, Path] = {}
+    used: set[str] = set()
     for path in paths:
         resolved = path.resolve()
         if not is_text(resolved):
@@ -300,13 +303,15 @@ def sequence_names(paths: list[Path], stored: Iterable[SequenceRecord] = ()) -> 
             raise InputError(f"{path}: is given twice")
         known = by_path.get(str(resolved))
         stem = (resolved.stem if resolved.is_file() else resolved.name).lstrip(".") or "sequence"
-        if known is None and stem in taken and not Path(taken[stem]).exists():
+        of_that_name = taken.get(stem.casefold())
+        if known is None and of_that_name is not None and not Path(of_that_name).exists():
             raise InputError(
-                f"{path}: the store has a recording named {stem} of {taken[stem]}, where there is none any more; "
+                f"{path}: the store has a recording named {stem} of {of_that_name}, where there is none any more; "
                 "if it has moved, move it back or use another folder"
             )
         name, number = known or stem, 2
-        while known is None and (name in names or name in taken):
+        while known is None and (name.casefold() in used or name.casefold() in taken):
             name, number = f"{resolved.parent.name}-{stem}" if number == 2 else f"{stem}-{number}", number + 1
         names[name] = resolved
+        used.add(name.casefold())
     return names

@@ -16,19 +16,21 @@ _DEPTH_MAPS = 16  # pairs of neighbours that are decoded
 def content_of(recording: Recording) -> str:
     """A digest of a recording, hexadecimal, the same wherever it lies; a look at it, not all of its bytes.
 
-    Of a file its size and three samples, among which a video has the places of all its frames. Of a folder its times,
-    the names and sizes of all pictures, and three of them as decoded.
+    Of a file its size and three samples, among which a video has the places of all its frames. Of a folder, and of a
+    file that lists pictures, its times, the names and sizes of all pictures, and three of them as decoded.
     """
     digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
+    looked_at = sorted({0, len(recording) // 2, len(recording) - 1} if len(recording) else ())
     if recording.path.is_file():
         _add_file(digest, recording.path)
-        return digest.hexdigest()
+        if not any(Path(recording.source(index)).is_file() for index in looked_at):
+            return digest.hexdigest()
     digest.update(recording.times.tobytes())
     for index in range(len(recording)):
         file = Path(recording.source(index))
         if file.is_file():
             digest.update(f"{file.name}\0{file.stat().st_size}\0".encode("utf-8", "surrogateescape"))
-    for index in sorted({0, len(recording) // 2, len(recording) - 1} if len(recording) else ()):
+    for index in looked_at:
         try:
             picture = recording.image(index)
         except (InputError, UnreadableFrameError):  # this frame is damaged or missing

@@ -98,13 +98,14 @@ def _read_images(folder: Path) -> tuple[Float64, list[Path], list[str]]:
             fields = [field.strip() for field in re.split(r"[,;\s]+", line.strip())]
             if not line.strip() or line.startswith("#") or (number == 0 and not fields[0].isdecimal()):
                 continue
-            if len(fields) >= 2 and re.fullmatch(r"\d{1,19}", fields[0]) and fields[1]:
-                rows.append((int(fields[0]), listed_file(folder / "data", fields[1])))
+            stamp = _nanoseconds(fields[0])
+            if len(fields) >= 2 and stamp is not None and fields[1]:
+                rows.append((stamp, listed_file(folder / "data", fields[1])))
             else:
                 bad += 1
     else:
         files = list_images(folder / "data")
-        rows = [(int(file.stem), file) for file in files if re.fullmatch(r"\d{1,19}", file.stem)]
+        rows = [(stamp, file) for file in files if (stamp := _nanoseconds(file.stem)) is not None]
     if not rows:
         raise InputError(f"{table}: has no row `timestamp [ns],filename`; repair it")
     stamps = np.array([stamp for stamp, _ in rows], np.int64)
@@ -112,6 +113,12 @@ def _read_images(folder: Path) -> tuple[Float64, list[Path], list[str]]:
     notes = [f"{table}: {bad} rows are not `timestamp,filename` and were left out"] if bad else []
     notes += [f"{table}: {repeated} rows repeat a time stamp and were left out"] if repeated else []
     return stamps[order] / 1e9, [rows[row][1] for row in order], notes
+
+
+def _nanoseconds(text: str) -> int | None:
+    """The stamp that a text is; None where it is none, or is later than 64 bits can say."""
+    stamp = int(text) if re.fullmatch(r"[0-9]{1,19}", text) else None
+    return None if stamp is None or stamp > np.iinfo(np.int64).max else stamp
 
 
 def _body_from_sensor(path: Path) -> Float64:

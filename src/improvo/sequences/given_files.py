@@ -50,7 +50,7 @@ def _content(given: str) -> str:
     digest = hashlib.sha256()
     for file in [path] if path.is_file() else sorted(each for each in path.rglob("*") if each.is_file()):
         name = "" if file == path else file.relative_to(path).as_posix()
-        digest.update(f"{name}\0{file.stat().st_size}\0".encode())
+        digest.update(f"{name}\0{file.stat().st_size}\0".encode("utf-8", "surrogateescape"))
         with file.open("rb") as opened:
             while part := opened.read(1 << 20):
                 digest.update(part)

@@ -54,7 +54,7 @@ class IclNuim(ImageFilesRecording):
         self._scale = depth_scale(self.calibration, settings, path) or DEPTH_SCALE
         truth = next(iter(sorted(path.glob("*.gt.freiburg"))), path / "groundtruth.txt" if _is_renamed(path) else None)
         if truth is not None:
-            poses_up, problems = read_trajectory_report(truth, "tum")
+            poses_up, problems = read_trajectory_report(truth, "tum", numbered=True)
             self.notes += problems
             poses = _UP_TO_DOWN @ poses_up.world_from_cam @ _UP_TO_DOWN
             self.ground_truth = Trajectory(poses_up.times / rate, poses)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from improvo.errors import InputError
 from improvo.sequences.base import Recording, UnreadableFrameError
 from improvo.sequences.grey_levels import SAMPLES, Stretch, stretch_of, to_8_bits
-from improvo.sequences.images import decode, file_bytes, is_file
+from improvo.sequences.images import decode, file_bytes
 from improvo.types import UInt8
-from improvo.untrusted.paths import check_is_file, is_text
+from improvo.untrusted.paths import check_is_file, is_file, is_text
 
 _HEAD = 1 << 16  # bytes in which a JPEG's orientation stands
 _FLAGS = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
@@ -27,14 +27,14 @@ class ImageFiles:
     """Files by their number. `notes` say what was done to their grey levels and orientation.
 
     An EXIF rotation that all pictures share (a phone held upright) is applied. If it changes within a recording, none
-    is applied, because the calibration holds for the unrotated pictures.
+    is applied, because the calibration holds for the unrotated pictures. Files that are missing or empty say nothing.
     """
 
     def __init__(self, files: Iterable[Path], where: Path) -> None:
         self.files = list(files)
         self.notes: list[str] = []
         self._flags = _FLAGS
-        noted = [orientation(file) for file in self.files]
+        noted = [orientation(file) for file in self.files if _has_content(file)]
         turned = sum(value != _PLAIN for value in noted)
         if turned and len(set(noted)) > 1:
             self._flags |= cv2.IMREAD_IGNORE_ORIENTATION
@@ -104,6 +104,13 @@ class ImageFilesRecording(Recording):
 
     def present(self) -> NDArray[np.bool_]:
         return self._images.present()
+
+
+def _has_content(path: Path) -> bool:
+    try:
+        return path.stat().st_size > 0
+    except (OSError, ValueError):
+        return False
 
 
 def orientation(path: Path) -> int:

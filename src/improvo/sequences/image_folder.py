@@ -66,7 +66,8 @@ class ImageFolder(ImageFilesRecording):
             if note is not None and truth is not None and len(truth) == len(files) and has_times(truth_file):
                 self.times, note = truth.times, f"has no time stamps; those of {truth_file.name} are taken, row by row"
             notes += [f"{path}: {note}"] if note else []
-        if truth is not None and not has_times(truth_file) and len(truth) == len(files):
+        by_rows = truth is not None and not has_times(truth_file, beside=settings.fps is None)
+        if truth is not None and by_rows and len(truth) == len(files):
             truth = Trajectory(self.times, truth.world_from_cam, truth.segment)
         self.ground_truth = truth
         self._images = ImageFiles(files, path)

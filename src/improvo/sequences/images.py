@@ -15,7 +15,7 @@ from improvo.sequences.base import UnreadableFrameError
 from improvo.sequences.grey_levels import to_8_bits
 from improvo.types import Float32, UInt8
 from improvo.untrusted.limits import MAX_PICTURE_BYTES
-from improvo.untrusted.paths import check_is_file
+from improvo.untrusted.paths import check_is_file, is_file
 from improvo.untrusted.pictures import check_picture
 from improvo.untrusted.text import reason
 
@@ -199,19 +199,12 @@ def listed_file(folder: Path, name: str) -> Path:
     return next((file for file in candidates if is_file(file)), folder / plain)
 
 
-def is_file(path: Path) -> bool:
-    """Whether there is such a file, whatever its name."""
-    try:
-        return path.is_file()
-    except OSError:  # a name that is longer than any can be, or in a folder that may not be looked into
-        return False
-
-
 def natural_key(name: str) -> list[tuple[int, str]]:
-    """Sorts numbers in names by value, however long they are."""
+    """Sorts numbers in names by value, however long they are; 07 before 7, in whatever order a folder lists them."""
     parts = [part for part in re.split(r"(\d+)", name) if part]
     digits = [part.lstrip("0") if part.isdecimal() else "" for part in parts]
-    return [(len(n), n) if part.isdecimal() else (-1, part) for part, n in zip(parts, digits, strict=True)]
+    by_value = [(len(n), n) if part.isdecimal() else (-1, part) for part, n in zip(parts, digits, strict=True)]
+    return [*by_value, (-2, name)]
 
 
 def file_bytes(path: Path) -> bytes:

@@ -3,6 +3,9 @@
 Courses hand out shortened copies whose folders are `image_l` and `image_r` and whose `calib.txt` is a row of twelve
 numbers a camera, without names.
 
+Where `times.txt` has more rows than there are pictures, as in a copy that leaves frames out, pictures are told by their
+numbers, which are those of the rows from 0 on.
+
 Poses are those of camera 0: `poses.txt` in the folder, or `poses/NN.txt` beside the `sequences` folder. The pose of
 another camera follows from its projection matrix, which is K [I | t].
 """
@@ -21,7 +24,8 @@ from improvo.geometry.trajectory_files import increasing_order, read_times, read
 from improvo.sequences.base import SequenceSettings
 from improvo.sequences.image_files import ImageFiles, ImageFilesRecording
 from improvo.sequences.images import list_images
-from improvo.types import Float64, Trajectory
+from improvo.types import Float64, Int64, Trajectory
+from improvo.untrusted.names import number_of
 
 FPS = 10.0
 _CAMERAS = {"image_0": 0, "image_2": 2, "image_1": 1, "image_3": 3, "image_l": 0, "image_r": 1}  # folder: number
@@ -40,20 +44,23 @@ class KittiOdometry(ImageFilesRecording):
         number = _CAMERAS[folder]
         files = list_images(path / folder)
         notes: list[str] = []
-        order = np.arange(len(files))
+        poses_file = next((file for file in _pose_files(path) if file.is_file()), None)
         if (path / "times.txt").is_file() and settings.fps is None:
-            times, said = read_times(path / "times.txt")
+            stamps, said = read_times(path / "times.txt")
             notes += said
-            if len(times) < len(files):
-                counts = f"{len(times)} times for {len(files)} images"
+            if len(stamps) < len(files):
+                counts = f"{len(stamps)} times for {len(files)} images"
                 raise InputError(f"{path / 'times.txt'}: has {counts}; repair it or give --fps")
-            if len(times) > len(files):
-                notes.append(f"{path}: {len(times) - len(files)} of {len(times)} images are missing at the end")
-            times = times[: len(files)]
-            order, repeated = increasing_order(times)
-            notes += [f"{path}: {repeated} images repeat a time stamp and were left out"] if repeated else []
+            rows = _rows_of(files, len(stamps))
+            if len(stamps) > len(files):
+                where = " at the end" if rows[-1] == len(files) - 1 else ""
+                notes.append(f"{path}: {len(stamps) - len(files)} of {len(stamps)} images are missing{where}")
         else:
-            times = order / (settings.fps or FPS)
+            rows = _rows_of(files, 0 if poses_file is None else _count(poses_file))
+            stamps = np.arange(rows[-1] + 1) / (settings.fps or FPS)
+        times = stamps[rows]
+        order, repeated = increasing_order(times)
+        notes += [f"{path}: {repeated} images repeat a time stamp and were left out"] if repeated else []
         self._images, self.times = ImageFiles([files[row] for row in order], path), times[order]
         notes += self._images.notes
         cam_from_cam0 = np.eye(4)
@@ -68,9 +75,8 @@ class KittiOdometry(ImageFilesRecording):
         self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: next(iter(published), None))
         if self.calibration is not None:
             self.calibration_error = None
-        poses_file = next((file for file in _pose_files(path) if file.is_file()), None)
         if poses_file is not None:
-            self.ground_truth, problems = _read_poses(poses_file, times, cam_from_cam0)
+            self.ground_truth, problems = _read_poses(poses_file, stamps, cam_from_cam0)
             notes += problems
         self.notes = tuple(notes)
 
@@ -81,6 +87,14 @@ class KittiOdometry(ImageFilesRecording):
 
 def _has_images(folder: Path) -> bool:
     return folder.is_dir() and bool(list_images(folder))
+
+
+def _rows_of(files: list[Path], count: int) -> Int64:
+    """(N,) which of `count` frames each picture is: by its number where pictures are missing, else one by one."""
+    numbers = [number_of(file.stem) for file in files]
+    rows = np.array([-1 if number is None else number for number in numbers], np.int64)
+    known = len(files) < count and rows.min() >= 0 and rows.max() < count and (np.diff(rows) > 0).all()
+    return rows if known else np.arange(len(files))
 
 
 def _pose_files(path: Path) -> tuple[Path, ...]:
@@ -115,8 +129,12 @@ def _read_poses(path: Path, times: Float64, cam_from_cam0: Float64) -> tuple[Tra
 
 
 def _at_least(times: Float64, path: Path) -> Float64:
-    """The images' times, continued where there are more poses than images (a shortened copy)."""
-    count = sum(1 for line in read_text(path, "poses").splitlines() if line.strip())
+    """The frames' times, continued where there are more poses than frames (a shortened copy)."""
     step = float(np.median(np.diff(times))) if len(times) > 1 else 1 / FPS
-    extra = max(0, count - len(times))
+    extra = max(0, _count(path) - len(times))
     return np.concatenate([times, times[-1] + step * np.arange(1, extra + 1)])
+
+
+def _count(path: Path) -> int:
+    """Rows of a file of poses."""
+    return sum(1 for line in read_text(path, "poses").splitlines() if line.strip())

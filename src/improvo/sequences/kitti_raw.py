@@ -16,7 +16,7 @@ from improvo.geometry.camera_files import Calibration, folder_calibration, load_
 from improvo.geometry.se3 import inverse, rigid, so3_exp
 from improvo.geometry.text_files import read_text
 from improvo.geometry.trajectory_files import clean_poses, increasing_order, read_times
-from improvo.sequences.base import SequenceSettings
+from improvo.sequences.base import SequenceSettings, UnreadableFrameError
 from improvo.sequences.image_files import ImageFiles, ImageFilesRecording
 from improvo.sequences.images import list_images
 from improvo.types import Float64, Trajectory
@@ -24,6 +24,7 @@ from improvo.untrusted.names import number_of
 
 FPS = 10.0
 EARTH_RADIUS = 6378137.0  # metres
+_PROBES = 5  # pictures tried for their size
 _CAMERAS = ("image_02", "image_00", "image_03", "image_01")  # the left colour camera first, then the left grey one
 
 
@@ -57,9 +58,19 @@ class KittiRaw(ImageFilesRecording):
         number = name[-2:]
         self.calibration = self.own_calibration(lambda: folder_calibration(path), lambda: _of_the_day(day, number))
         if day is not None and (path / "oxts" / "data").is_dir():
-            self.ground_truth, problems = _inertial_poses(path / "oxts", day, number)
+            self.ground_truth, problems = _inertial_poses(path / "oxts", day, number, self._size())
             notes += problems
         self.notes = (*notes, *self._images.notes)
+
+    def _size(self) -> tuple[int, int] | None:
+        """Width and height of the first picture that can be read."""
+        for index in range(min(len(self._images), _PROBES)):
+            try:
+                height, width = self._images.read(index).shape[:2]
+            except UnreadableFrameError:
+                continue
+            return width, height
+        return None
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -74,10 +85,12 @@ def _of_the_day(day: Path | None, number: str) -> Calibration | None:
     return None if day is None else load_calibration(str(day / "calib_cam_to_cam.txt"), number)
 
 
-def _inertial_poses(folder: Path, day: Path, number: str) -> tuple[Trajectory | None, list[str]]:
+def _inertial_poses(
+    folder: Path, day: Path, number: str, size: tuple[int, int] | None
+) -> tuple[Trajectory | None, list[str]]:
     """World_from_cam of every row of the GPS and inertial unit; a note where the calibration for it is missing."""
     try:
-        cam_from_imu = _cam_from_imu(day, number)
+        cam_from_imu = _cam_from_imu(day, number, size)
         times, _ = read_times(folder / "timestamps.txt")
     except InputError as error:
         return None, [f"{folder}: is left out, so there is no ground truth ({str(error).split(';')[0]})"]
@@ -88,13 +101,14 @@ def _inertial_poses(folder: Path, day: Path, number: str) -> tuple[Trajectory | 
         return None, []
     numbers = [number for number, _ in known]
     rows = np.array([_oxts_row(file) for _, file in known])
-    scale = np.cos(np.radians(rows[0, 0]))
+    whole = int(np.argmax(np.isfinite(rows).all(axis=1)))  # the first that is not damaged
+    scale = np.cos(np.radians(rows[whole, 0]))
     east = scale * np.radians(rows[:, 1]) * EARTH_RADIUS
     north = scale * EARTH_RADIUS * np.log(np.tan(np.radians(90 + rows[:, 0]) / 2))
     place = np.stack([east, north, rows[:, 2]], axis=1)
     axes = np.eye(3)
     turn = [so3_exp(rows[:, 3 + axis, None] * axes[axis]) for axis in range(3)]  # roll, pitch, yaw
-    world_from_imu = rigid(turn[2] @ turn[1] @ turn[0], place - place[0])
+    world_from_imu = rigid(turn[2] @ turn[1] @ turn[0], place - place[whole])
     poses = clean_poses(world_from_imu @ inverse(cam_from_imu))[0]
     order, _ = increasing_order(times[numbers])
     stamps = times[numbers][order]
@@ -110,17 +124,34 @@ def _oxts_row(path: Path) -> list[float]:
         return [np.nan] * 6
 
 
-def _cam_from_imu(day: Path, number: str) -> Float64:
-    """From the inertial unit over the laser scanner to the rectified camera."""
+def _cam_from_imu(day: Path, number: str, size: tuple[int, int] | None) -> Float64:
+    """From the inertial unit over the laser scanner to the camera: the rectified one, or the one as it was built in.
+
+    Args:
+        day: folder of the calibration.
+        number: of the camera.
+        size: width and height of its pictures, which tell whether they are rectified.
+    """
     rows = _rows(day / "calib_cam_to_cam.txt")
-    projection = _numbers(rows, f"P_rect_{number}", (3, 4), day)
-    rectified_from_cam0 = rigid(_numbers(rows, "R_rect_00", (3, 3), day), np.zeros(3))
-    shift = np.linalg.solve(projection[:, :3], projection[:, 3]).astype(np.float64)
+    if _size_of(rows, f"S_rect_{number}", day) not in (None, size) and _size_of(rows, f"S_{number}", day) == size:
+        cam_from_cam0 = rigid(_numbers(rows, f"R_{number}", (3, 3), day), _numbers(rows, f"T_{number}", (3,), day))
+    else:
+        projection = _numbers(rows, f"P_rect_{number}", (3, 4), day)
+        shift = np.linalg.solve(projection[:, :3], projection[:, 3]).astype(np.float64)
+        cam_from_cam0 = rigid(np.eye(3), shift) @ rigid(_numbers(rows, "R_rect_00", (3, 3), day), np.zeros(3))
     motions = []
     for name in ("calib_velo_to_cam.txt", "calib_imu_to_velo.txt"):
         rows = _rows(day / name)
         motions.append(rigid(_numbers(rows, "R", (3, 3), day), _numbers(rows, "T", (3,), day)))
-    return rigid(np.eye(3), shift) @ rectified_from_cam0 @ motions[0] @ motions[1]
+    return cam_from_cam0 @ motions[0] @ motions[1]
+
+
+def _size_of(rows: dict[str, list[str]], name: str, day: Path) -> tuple[int, int] | None:
+    """Width and height in a row of the calibration; None without the row."""
+    if name not in rows:
+        return None
+    width, height = _numbers(rows, name, (2,), day).tolist()
+    return round(width), round(height)
 
 
 def _rows(path: Path) -> dict[str, list[str]]:

@@ -26,7 +26,11 @@ _ADDRESS = re.compile(r"(rtsps?|rtmps?|https?|udp|tcp|srt)://.+", re.IGNORECASE)
 
 
 def is_live(path: str) -> bool:
-    """Whether this is the number of a webcam or the address of a stream, and no file of that name."""
+    """Whether this is the number of a webcam or the address of a stream, and no file of that name.
+
+    Args:
+        path: as given, or a `Path` of it as text, which on Windows has backslashes.
+    """
     if _ADDRESS.fullmatch(path) or _address(path) is not None:
         return True
     return re.fullmatch(r"\d{1,3}", path) is not None and not Path(path).exists()
@@ -45,8 +49,8 @@ class LiveStream(Recording):
         self._capture = _open(self._name)
         self.times = np.zeros(0)
         self.dropped = 0  # frames that came while the last one was still worked on
-        self.delivered = 0
-        self._latest: tuple[float, UInt8] | None = None
+        self._arrivals = 0  # frames that came
+        self._latest: tuple[int, float, UInt8] | None = None
         self._ended = False
         self._arrived = threading.Condition()
         self._thread = threading.Thread(target=self._watch, name=f"improvo {self._name}", daemon=True)
@@ -62,13 +66,14 @@ class LiveStream(Recording):
     def image(self, index: int) -> UInt8:
         raise UnreadableFrameError("a live stream has no random access")
 
-    def next_frame(self) -> tuple[float, UInt8] | None:
-        """Seconds since 1970 and the newest frame not yet delivered, waiting for it; None when the source is gone."""
+    def next_frame(self) -> tuple[int, float, UInt8] | None:
+        """The newest frame not yet delivered, after its number and its seconds since 1970, waiting for it.
+
+        None when the source is gone.
+        """
         with self._arrived:
             self._arrived.wait_for(lambda: self._latest is not None or self._ended, FRAME_TIMEOUT)
             latest, self._latest = self._latest, None
-        if latest is not None:
-            self.delivered += 1
         return latest
 
     def close(self) -> None:
@@ -89,15 +94,19 @@ class LiveStream(Recording):
                     self._ended = True
                 else:
                     self.dropped += self._latest is not None
-                    self._latest = (now, np.asarray(image))
+                    self._latest = (self._arrivals, now, np.asarray(image))
+                    self._arrivals += 1
                 self._arrived.notify_all()
         self._capture.release()
 
 
 def _address(path: str) -> str | None:
-    """The stream's address; a `Path` turns `rtsp://` into `rtsp:/`."""
-    match = re.fullmatch(r"((?:rtsps?|rtmps?|https?|udp|tcp|srt):)/+([^/].*)", path, re.IGNORECASE)
-    return f"{match.group(1)}//{match.group(2)}" if match else None
+    """The stream's address; a `Path` turns `rtsp://` into `rtsp:/`, on Windows with backslashes."""
+    match = re.fullmatch(r"((?:rtsps?|rtmps?|https?|udp|tcp|srt):)(/+|\\+)([^/\\].*)", path, re.IGNORECASE)
+    if match is None:
+        return None
+    scheme, separator, rest = match.groups()
+    return f"{scheme}//{rest if separator[0] == '/' else rest.replace(separator[0], '/')}"
 
 
 def _open(name: str) -> cv2.VideoCapture:

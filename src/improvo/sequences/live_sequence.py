@@ -38,9 +38,9 @@ class LiveSequence(Sequence):
             recording.close()
             raise InputError(f"{recording.path}: opened, but no frame came; check the camera or the address")
         self._live = recording
-        self._first: tuple[float, np.ndarray] | None = first
+        self._first: tuple[int, float, np.ndarray] | None = first
         self._so_far: list[float] = []
-        height, width = first[1].shape[:2]
+        height, width = first[2].shape[:2]
         try:
             self._set_up(recording, settings, width, height)
         except InputError:
@@ -77,8 +77,7 @@ class LiveSequence(Sequence):
                 latest, self._first = self._first or self._live.next_frame(), None
                 if latest is None:
                     return
-                time, image = latest
-                index = self._live.delivered + self._live.dropped - 1
+                index, time, image = latest
                 if index % self.settings.stride or (image.shape[1], image.shape[0]) != self._raw_size:
                     continue
                 self._so_far.append(time)

@@ -99,6 +99,11 @@ def open_recording(path: Path | str, settings: SequenceSettings | None = None, *
         ) from None
 
 
+def is_recording(path: Path) -> bool:
+    """Whether some reader takes a path; nothing is opened."""
+    return any(recording.recognises(path) for recording in _formats())
+
+
 def _recording(path: Path, settings: SequenceSettings) -> Recording:
     live = is_live(str(path))
     if not live and not path.exists():

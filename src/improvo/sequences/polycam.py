@@ -16,6 +16,7 @@ from improvo.sequences.image_files import ImageFiles, ImageFilesRecording
 from improvo.sequences.images import depth_of_size, list_images, read_depth
 from improvo.sequences.varying_camera import median_calibration, read_json, trajectory_from_opengl
 from improvo.types import Float32
+from improvo.untrusted.limits import MAX_PIXELS
 from improvo.untrusted.numbers import numbers
 
 DEPTH_SCALE = 1000.0
@@ -55,7 +56,8 @@ class Polycam(ImageFilesRecording):
         notes += self._images.notes
         self._depth = [folder / "depth" / f"{name}.png" for name in names]
         size_numbers = numbers([cameras[0].get("width"), cameras[0].get("height")], 2)
-        size = (int(size_numbers[0]), int(size_numbers[1])) if (size_numbers >= 1).all() else None
+        possible = (size_numbers >= 1).all() and size_numbers.prod() <= MAX_PIXELS
+        size = (int(size_numbers[0]), int(size_numbers[1])) if possible else None
         intrinsics = np.stack([numbers([c.get(key) for key in ("fx", "fy", "cx", "cy")], 4) for c in cameras])
         more: list[str] = []
         name = str(folder / f"{prefix}cameras")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from improvo.geometry.camera_files import Calibration, load_calibration
 from improvo.sequences.base import SequenceSettings
+from improvo.untrusted.paths import is_file
 
 AUTO = "auto"  # as --camera: found from the motion of the recording itself, before it is opened
 DEFAULT_FPS = 30.0
@@ -24,7 +25,7 @@ def given_calibration(settings: SequenceSettings, recording: Path) -> Calibratio
     if settings.camera is None or settings.camera == AUTO:
         return None
     own = Path(settings.camera) / f"{recording_name(recording)}.yaml"
-    return load_calibration(str(own) if own.is_file() else settings.camera)
+    return load_calibration(str(own) if is_file(own) else settings.camera)
 
 
 def recording_name(path: Path) -> str:

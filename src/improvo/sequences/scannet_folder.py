@@ -158,7 +158,7 @@ def _info_file(path: Path) -> Path | None:
 
 
 def _numbered(path: Path) -> list[Path]:
-    pictures = [file for file in list_images(path) if ".color." in file.name]
+    pictures = [file for file in list_images(path) if file.name.startswith("frame-") and ".color." in file.name]
     return [file for file in pictures if number_of(file.name.split(".")[0][6:]) is not None]
 
 

@@ -156,7 +156,7 @@ class Sequence:
         return self._rectifier.depth(depth)
 
     def colour(self, i: int) -> UInt8:
-        """The picture of the i-th selected frame in colour (H, W, 3), BGR, same geometry as its image.
+        """A copy of the i-th selected frame's picture in colour (H, W, 3), BGR, same geometry as its image.
 
         Raises:
             InputError: the frame cannot be decoded.
@@ -167,7 +167,8 @@ class Sequence:
         except UnreadableFrameError as error:
             raise InputError(f"{self.recording.source(index)}: {error}; leave this frame out") from None
         colourless = raw.ndim == 2 or raw.shape[2] == 1
-        return self._rectifier.image(cv2.cvtColor(grey(raw), cv2.COLOR_GRAY2BGR) if colourless else raw[..., :3])
+        picture = self._rectifier.image(cv2.cvtColor(grey(raw), cv2.COLOR_GRAY2BGR) if colourless else raw[..., :3])
+        return picture.copy() if np.may_share_memory(picture, raw) else picture  # a video keeps its last picture
 
     def mask(self, i: int) -> Mask | None:
         """Where keypoints may be in the i-th selected frame (H, W); None is everywhere."""

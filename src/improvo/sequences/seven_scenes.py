@@ -34,7 +34,9 @@ class SevenScenes(ImageFilesRecording):
 
     def __init__(self, path: Path, settings: SequenceSettings) -> None:
         self.path = path
-        found = {int(match.group(1)): file for file, match in _colour_files(path)}
+        # of two files of one number the later by name, whose picture is PNG, not JPEG
+        by_name = sorted(_colour_files(path), key=lambda each: each[0].name)
+        found = {int(match.group(1)): file for file, match in by_name}
         if not found:
             raise InputError(f"{path}: has no frame-NNNNNN.color.png files, so it is no 7-Scenes sequence")
         self._numbers = sorted(found)

@@ -95,6 +95,8 @@ def label_stability(
     first = np.flatnonzero(np.diff(tracks.track, prepend=np.iinfo(np.int64).min)) if len(tracks) else np.zeros(0, int)
     row_track = np.repeat(np.arange(len(first)), np.diff(first, append=len(tracks)))
     count = len(first)
+    if point is not None and np.shape(point) != (count,):
+        raise ValueError(f"point: shape {np.shape(point)}, expected {(count,)}")
 
     home = _home_segment(np.asarray(segment)[tracks.frame], row_track, count)
     rows = np.flatnonzero((segment[tracks.frame] == home[row_track]) & (home[row_track] >= 0))

@@ -26,6 +26,14 @@ def as_text(name: str) -> str:
     return "".join("\N{REPLACEMENT CHARACTER}" if 0xD800 <= ord(each) <= 0xDFFF else each for each in name)
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is such a file, whatever its name."""
+    try:
+        return path.is_file()
+    except OSError:  # a name that is longer than any can be, or in a folder that may not be looked into
+        return False
+
+
 def check_path(path: Path, reachable: bool = False) -> Path:
     """The path, if the system can look it up; whether something is there does not matter.
 

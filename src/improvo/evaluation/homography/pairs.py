@@ -106,7 +106,7 @@ def _random_views(scene: Scene, reference: UInt8, settings: HomographySettings) 
         raise InputError(
             f"{scene.reference}: is {size[0]}x{size[1]} pixels; give pictures of {2 * CELL}x{2 * CELL} or more"
         )
-    rng = np.random.default_rng([settings.seed, zlib.crc32(scene.name.encode())])
+    rng = np.random.default_rng([settings.seed, zlib.crc32(scene.name.encode("utf-8", "surrogateescape"))])
     shape = ViewSettings(height=height, width=width, smallest_zoom=0.7, largest_zoom=1.1)
     middle = np.array([size[0] - 1, size[1] - 1]) / 2.0
     homographies = [random_view(rng, shape, size, middle) for _ in range(settings.views)]

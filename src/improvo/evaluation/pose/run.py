@@ -103,6 +103,8 @@ def _features_of(
             for found in workers.run(extract, tasks, f"{frontend.label} on {sequence.name}"):
                 features.update({frame: value for frame, value in found.items() if value is not None})
                 unreadable |= {frame for frame, value in found.items() if value is None}
-            write_cache(folder, fingerprint, features)
+            known = None  # its files are open, and Windows replaces no open file
+            if features:  # of frames none of which can be decoded there is nothing to keep
+                write_cache(folder, fingerprint, features)
         folders.append(folder)
     return folders, tuple(sorted(unreadable))

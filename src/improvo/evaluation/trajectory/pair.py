@@ -7,11 +7,11 @@ from pathlib import Path
 
 from improvo.errors import InputError
 from improvo.evaluation.truth.reference import lacks_times
-from improvo.geometry.trajectory_files import has_times, read_trajectory_report
+from improvo.geometry.trajectory_files import NO_TIMES, has_times, read_trajectory_report
 from improvo.odometry.run.run_folder import RunFolder
 from improvo.odometry.run.run_json import why_no_pose
 from improvo.sequences.base import SequenceSettings
-from improvo.sequences.opening import true_trajectory
+from improvo.sequences.opening import is_recording, true_trajectory
 from improvo.types import Trajectory
 
 
@@ -94,7 +94,7 @@ def _truth(given: Trajectory | Path, sequence: SequenceSettings | None, referenc
         )
     if (given / "run.json").is_file():
         return _of_run(given)
-    if not given.is_dir():
+    if not (given.is_dir() or (given.is_file() and is_recording(given))):
         return _of_file(given)
     found = true_trajectory(given, sequence)
     if found is None:
@@ -129,6 +129,6 @@ def _at_rows_of(counted: _Side, timed: _Side) -> _Side:
     """Poses without times at the times of the same number of other poses, with a note that says so."""
     rows, poses = len(timed.trajectory), counted.trajectory
     note = f"{counted.name}: has no times; its {rows} poses are taken as the {rows} of {timed.name}, row by row"
-    return replace(
-        counted, trajectory=Trajectory(timed.trajectory.times, poses.world_from_cam, poses.segment), notes=(note,)
-    )
+    others = tuple(each for each in counted.notes if not each.endswith(NO_TIMES))
+    at_times = Trajectory(timed.trajectory.times, poses.world_from_cam, poses.segment)
+    return replace(counted, trajectory=at_times, notes=(note, *others))

@@ -81,8 +81,14 @@ def write_reference(
         comments: further lines for a reader.
 
     Raises:
+        InputError: a camera with other distortion, which the file cannot hold.
         OutputError: it cannot be written.
     """
+    if not camera.is_pinhole and (camera.distortion_model != "brown" or any(camera.distortion[4:])):
+        raise InputError(
+            f"{path}: holds k1 k2 p1 p2 of a lens, and the {camera.distortion_model} camera has {camera.distortion}; "
+            "undistort the images, or make the COLMAP model with the camera model OPENCV"
+        )
     lines = [f"# {comment}" for comment in comments]
     lines += [
         f"# images {camera.width}x{camera.height}",

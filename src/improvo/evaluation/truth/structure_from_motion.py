@@ -122,6 +122,11 @@ def reconstruct(
             f"{sequence.path}: its {start.distortion_model} camera has no place in a truth file, which holds "
             "k1 k2 p1 p2; undistort the images first"
         )
+    if settings.calibrate == "none" and any(start.distortion[4:]):
+        raise InputError(
+            f"{sequence.path}: its camera has more distortion than k1 k2 p1 p2, which is all that a truth file holds; "
+            "leave out --calibrate none, or undistort the images first"
+        )
     if not (folder / "model").is_dir():
         _check_space(folder, len(sequence) * (start.width * start.height + _FEATURE_BYTES * settings.max_features))
         names = _write_images(sequence, folder, progress)

@@ -89,7 +89,7 @@ def _outcome(sequence: Sequence, task: VoTask, variant: str, frames: int, trajec
         segments = aligned_segments(trajectory, clean_truth(truth)[0], task.trajectory)
         errors = to_dict(evaluate(trajectory, truth, task.trajectory))
     except InputError as error:
-        note = str(error) if len(trajectory) else "odometry found no pose"
+        note = str(error) if trajectory.valid.any() else "odometry found no pose"
     return VoOutcome(sequence.name, task.frontend.label, variant, frames, trajectory, segments, errors, note)
 
 

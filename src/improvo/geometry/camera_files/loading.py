@@ -16,7 +16,7 @@ from improvo.geometry.camera_files.containers import parse_npz, parse_tree
 from improvo.geometry.camera_files.plain_text import from_plain_text, is_plain
 from improvo.geometry.camera_files.tree import cameras
 from improvo.geometry.text_files import read_text
-from improvo.untrusted.paths import check_is_file, check_path
+from improvo.untrusted.paths import check_is_file, check_path, is_file
 
 IN_FOLDERS = ("camera.yaml", "camera.yml", "camera.json", "camera.txt")
 _UNSAFE = (".pkl", ".pickle", ".npy", ".mat", ".m", ".py", ".sfm")
@@ -69,7 +69,7 @@ def folder_calibration(folder: Path, names: tuple[str, ...] = IN_FOLDERS) -> Cal
         InputError: it lies there and cannot be used.
     """
     for name in names:
-        if (folder / name).is_file():
+        if is_file(folder / name):
             return load_calibration(str(folder / name))
     return None
 
