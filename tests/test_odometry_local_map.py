@@ -7,11 +7,11 @@ import pytest
 from simulated_features import CAMERA, hand_motion, nothing_to_see, observe, room, views_of
 
 from improvo.geometry import se3
-from improvo.odometry.result.events import EventLog
 from improvo.odometry.gates import MEMORY_FRAMES
 from improvo.odometry.mapping import local_map as local_map_module
 from improvo.odometry.mapping.local_map import LocalMap
 from improvo.odometry.mapping.start import start_map
+from improvo.odometry.result.events import EventLog
 from improvo.odometry.settings import OdometrySettings
 from improvo.odometry.view import View
 
