@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from improvo.frontend.network import NetworkFrontend
+from improvo.frontend.runtime_openvino import loses_large_products
 from improvo.frontend.settings import NetworkSettings
 from improvo.frontend.weights_files import BUNDLED, bundled_names, find_weights, load_weights
 from improvo.types import Float32, UInt8
@@ -115,6 +116,7 @@ def test_int8_finds_nearly_the_same(frontend, drawings):
     for picture in drawings[:2]:
         float32, int8 = exact(picture), rounded(picture)
         rows, columns = np.nonzero((int8.keypoints[:, None] == float32.keypoints).all(axis=2))
-        assert len(rows) > 0.85 * len(float32)
+        narrow = loses_large_products()  # processors without VNNI: weights are rounded to half as many values
+        assert len(rows) > (0.8 if narrow else 0.85) * len(float32)
         cosine = (int8.descriptors[rows] * float32.descriptors[columns]).sum(axis=1)
-        assert np.median(cosine) > 0.999
+        assert np.median(cosine) > (0.997 if narrow else 0.999)

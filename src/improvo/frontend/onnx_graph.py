@@ -95,10 +95,17 @@ class NetworkNodes:
         graph: to add to.
         weights: of any architecture.
         ranges: in eight bits, the largest activation by the name of the layer that reads it; empty for float32.
+        largest: whole number that stands for a weight in eight bits.
     """
 
-    def __init__(self, graph: OnnxGraph, weights: Weights, ranges: Mapping[str, float] | None = None) -> None:
-        self._graph = graph
+    def __init__(
+        self,
+        graph: OnnxGraph,
+        weights: Weights,
+        ranges: Mapping[str, float] | None = None,
+        largest: int = WEIGHT_MAX,
+    ) -> None:
+        self._graph, self._largest = graph, largest
         self._layers = {layer.convolution.name: layer for layer in weights.folded()}
         self._heads = weights.architecture.heads
         self._ranges = {**ranges, "encoder.0": 1.0} if ranges else {}
@@ -126,9 +133,12 @@ class NetworkNodes:
         layer, graph = self._layers[name], self._graph
         weight = layer.weight
         if self._ranges and name == "encoder.0":
-            node, weight = graph.node("Concat", *[node] * IMAGE_COPIES, axis=1), spread_over_copies(weight)
+            node, weight = (
+                graph.node("Concat", *[node] * IMAGE_COPIES, axis=1),
+                spread_over_copies(weight, self._largest),
+            )
         rounded = bool(self._ranges) and in_eight_bits(name, layer.convolution.kernel)
-        kernel = self._rounded_weight(weight) if rounded else graph.constant(weight)
+        kernel = rounded_weight(graph, weight, self._largest) if rounded else graph.constant(weight)
         pad = layer.convolution.kernel // 2
         node = graph.node("Conv", node, kernel, graph.constant(layer.bias), pads=[pad] * 4)
         return node if layer.convolution.kernel == 1 else self._activated(layer, node)
@@ -142,19 +152,27 @@ class NetworkNodes:
         return node
 
     def _rounded(self, reader: str, node: str) -> str:
-        if not self._ranges:
-            return node
-        scale = self._graph.number(self._ranges[reader] / ACTIVATION_MAX)
-        zero = self._graph.constant(np.array(0, np.uint8))  # unsigned: nothing is negative behind a ReLU
-        whole = self._graph.node("QuantizeLinear", node, scale, zero)
-        return str(self._graph.node("DequantizeLinear", whole, scale, zero))
+        return rounded(self._graph, node, self._ranges[reader]) if self._ranges else node
 
-    def _rounded_weight(self, weight: Float32) -> str:
-        step = np.maximum(largest_of_channels(weight), 1e-30) / np.float32(WEIGHT_MAX)
-        whole = np.clip(np.rint(weight / step), -WEIGHT_MAX, WEIGHT_MAX).astype(np.int8)
-        steps, zeros = np.asarray(step.ravel(), np.float32), np.zeros(len(whole), np.int8)
-        inputs = [self._graph.constant(values) for values in (whole, steps, zeros)]
-        return str(self._graph.node("DequantizeLinear", *inputs, axis=0))
+
+def rounded(graph: OnnxGraph, node: str, largest: float) -> str:
+    """An activation, rounded to 256 values from zero to `largest`; unsigned: nothing is negative behind a ReLU."""
+    scale, zero = graph.number(largest / ACTIVATION_MAX), graph.constant(np.array(0, np.uint8))
+    return str(graph.node("DequantizeLinear", graph.node("QuantizeLinear", node, scale, zero), scale, zero))
+
+
+def rounded_weight(graph: OnnxGraph, weight: Float32, largest: int) -> str:
+    """A weight (O, I, k, k), rounded around zero with one step for each output channel.
+
+    Args:
+        graph: to add to.
+        weight: of a convolution.
+        largest: whole number that stands for the largest weight of a channel.
+    """
+    step = np.maximum(largest_of_channels(weight), 1e-30) / np.float32(largest)
+    whole = np.clip(np.rint(weight / step), -largest, largest).astype(np.int8)
+    steps, zeros = np.asarray(step.ravel(), np.float32), np.zeros(len(whole), np.int8)
+    return str(graph.node("DequantizeLinear", *(graph.constant(values) for values in (whole, steps, zeros)), axis=0))
 
 
 def add_heat_map(graph: OnnxGraph, logits: str) -> str:

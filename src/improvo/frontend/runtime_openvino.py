@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from improvo.frontend.int8 import (
     in_eight_bits,
     largest_of_channels,
     spread_over_copies,
+    weight_max,
 )
 from improvo.frontend.openvino_library import CORE, plain_letters
 from improvo.frontend.openvino_library import openvino as ov
@@ -25,6 +27,7 @@ from improvo.frontend.weights_files import Weights
 from improvo.types import Float32
 
 _KEPT_SIZES = 4
+_PROBED = (1, 4, 16, 16)  # shape of what is multiplied to see whether large products are lost
 
 
 class OpenVinoRuntime:
@@ -92,6 +95,17 @@ def activation_ranges(weights: Weights, images: Float32, quantile: float) -> dic
     return {reader: float(np.quantile(found[position], quantile)) for position, reader in enumerate(graph.readers)}
 
 
+@cache
+def loses_large_products() -> bool:
+    """Whether eight bits are added up in too few bits here (see `int8.py`): 4 · 1 · 1 is not 4 then. It takes 50 ms."""
+    with plain_letters():
+        image = ops.parameter(list(_PROBED), np.float32, name="image")
+        ones = _quantised_weight(np.ones((4, 4, 3, 3), np.float32), WEIGHT_MAX)
+        node = ops.relu(ops.convolution(_rounded(image, 1.0), ones, [1, 1], [0, 0], [0, 0], [1, 1]))
+        compiled = CORE.compile_model(_model([node.output(0)], image), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+    return bool(compiled([np.ones(_PROBED, np.float32)])[0].min() < 0.99 * 4 * 9)
+
+
 class _Graph:
     """Builds the network's graph, layer by layer.
 
@@ -103,6 +117,7 @@ class _Graph:
         self._layers = {layer.convolution.name: layer for layer in weights.folded()}
         self._heads = weights.architecture.heads
         self._ranges = {**ranges, "encoder.0": 1.0} if ranges else {}
+        self._weight_max = weight_max(bool(ranges) and loses_large_products())
         self.readers = [*(f"encoder.{layer}" for layer in range(1, 8)), "heads", *(f"{head}.1" for head in self._heads)]
 
     def model(self, shape: tuple[int, ...], taps: bool = False) -> Any:
@@ -135,9 +150,9 @@ class _Graph:
         weight = ops.constant(layer.weight)
         if self._ranges and name == "encoder.0":
             node = ops.concat([node] * IMAGE_COPIES, axis=1)
-            weight = _quantised_weight(spread_over_copies(layer.weight))
+            weight = _quantised_weight(spread_over_copies(layer.weight, self._weight_max), self._weight_max)
         elif self._ranges and in_eight_bits(name, layer.convolution.kernel):
-            weight = _quantised_weight(layer.weight)
+            weight = _quantised_weight(layer.weight, self._weight_max)
         pad = layer.convolution.kernel // 2
         node = ops.convolution(node, weight, [1, 1], [pad, pad], [pad, pad], [1, 1])
         node = ops.add(node, _channels(layer.bias))
@@ -149,18 +164,20 @@ class _Graph:
         return node
 
     def _quantised(self, reader: str, node: Any) -> Any:
-        if not self._ranges:
-            return node
-        low, high = ops.constant(np.float32(0)), ops.constant(np.float32(self._ranges[reader]))
-        # unsigned: nothing is negative behind a ReLU
-        return ops.fake_quantize(node, low, high, low, high, ACTIVATION_MAX + 1)
+        return _rounded(node, self._ranges[reader]) if self._ranges else node
 
 
-def _quantised_weight(weight: Float32) -> Any:
-    """Signed and symmetric, with one step for each output channel."""
+def _rounded(node: Any, largest: float) -> Any:
+    """To 256 values from zero on; unsigned, since nothing is negative behind a ReLU."""
+    low, high = ops.constant(np.float32(0)), ops.constant(np.float32(largest))
+    return ops.fake_quantize(node, low, high, low, high, ACTIVATION_MAX + 1)
+
+
+def _quantised_weight(weight: Float32, largest: int) -> Any:
+    """Signed and symmetric, with one step for each output channel; `largest` stands for its largest weight."""
     limit = largest_of_channels(weight)
     low, high = ops.constant(-limit), ops.constant(limit)
-    return ops.fake_quantize(ops.constant(weight), low, high, low, high, 2 * WEIGHT_MAX + 1)
+    return ops.fake_quantize(ops.constant(weight), low, high, low, high, 2 * largest + 1)
 
 
 def _heat_map(logits: Any) -> Any:
