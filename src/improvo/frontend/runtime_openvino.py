@@ -175,9 +175,10 @@ def _rounded(node: Any, largest: float) -> Any:
 
 def _quantised_weight(weight: Float32, largest: int) -> Any:
     """Signed and symmetric, with one step for each output channel; `largest` stands for its largest weight."""
-    limit = largest_of_channels(weight)
+    # OpenVINO computes 255 values in eight bits, but fewer in float32; so the range is wider than the weights instead
+    limit = largest_of_channels(weight) * np.float32(WEIGHT_MAX / largest)
     low, high = ops.constant(-limit), ops.constant(limit)
-    return ops.fake_quantize(ops.constant(weight), low, high, low, high, 2 * largest + 1)
+    return ops.fake_quantize(ops.constant(weight), low, high, low, high, 2 * WEIGHT_MAX + 1)
 
 
 def _heat_map(logits: Any) -> Any:
