@@ -636,7 +636,7 @@ def test_the_card_says_the_rule_that_was_used(tmp_path: Path, monkeypatch: pytes
         measured = replace(measured, scores=(*measured.scores, before))
     folder: Any = SimpleNamespace(weights=tmp_path / "weights.safetensors", report=None, finished_rounds=lambda: 0)
     split: Any = None
-    loop._keep(Improvement(folder.weights, 0, (start,), (measured,)), folder, split, ImproveSettings())
+    loop._keep(Improvement(folder.weights, 0, (start,), (measured,), ("",)), folder, split, ImproveSettings())
     said = load_weights(folder.weights).card.metrics["improvement"]["rule"]
     assert said == rule(ValidationSettings(), earlier)
     assert ("In no recording of an earlier run" in said) == earlier
