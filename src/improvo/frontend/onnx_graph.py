@@ -133,12 +133,10 @@ class NetworkNodes:
         layer, graph = self._layers[name], self._graph
         weight = layer.weight
         if self._ranges and name == "encoder.0":
-            node, weight = (
-                graph.node("Concat", *[node] * IMAGE_COPIES, axis=1),
-                spread_over_copies(weight, self._largest),
-            )
-        rounded = bool(self._ranges) and in_eight_bits(name, layer.convolution.kernel)
-        kernel = rounded_weight(graph, weight, self._largest) if rounded else graph.constant(weight)
+            node = graph.node("Concat", *[node] * IMAGE_COPIES, axis=1)
+            weight = spread_over_copies(weight, self._largest)
+        eight_bits = bool(self._ranges) and in_eight_bits(name, layer.convolution.kernel)
+        kernel = rounded_weight(graph, weight, self._largest) if eight_bits else graph.constant(weight)
         pad = layer.convolution.kernel // 2
         node = graph.node("Conv", node, kernel, graph.constant(layer.bias), pads=[pad] * 4)
         return node if layer.convolution.kernel == 1 else self._activated(layer, node)

@@ -16,7 +16,7 @@ import numpy as np
 from improvo.geometry import se3
 from improvo.geometry.camera import Camera
 from improvo.geometry.triangulation import triangulate_tracks
-from improvo.odometry.gates import SAME_TURN_DEG
+from improvo.odometry.gates import SAME_PATH, SAME_TURN_DEG
 from improvo.odometry.mapping.initial_pair import InitFailure
 from improvo.odometry.mapping.start import start_map
 from improvo.odometry.result.events import EventLog
@@ -29,7 +29,6 @@ Poses = Mapping[int, Float64]  # cam_from_world (4, 4) by frame index
 
 _LEAST_VIEWS = 3  # of a track: two views fit a point of their own under nearly any poses
 _BETTER = 1.1  # times as many tracks: less is chance (docs/log-odometry.md)
-_SAME = 0.5  # of the error that a segment may have, and of one turn: two maps so near to each other are the same
 
 
 @dataclass(frozen=True)
@@ -181,10 +180,10 @@ def same_poses(former: Poses, anew: Poses, max_error: float) -> bool:
         return False
     a, b = (np.stack([poses[frame] for frame in frames]) for poses in (former, anew))
     turned = se3.rotation_angle_deg(_turns(a).transpose(0, 2, 1) @ _turns(b))
-    if turned.max() > _SAME * SAME_TURN_DEG:
+    if turned.max() > SAME_PATH * SAME_TURN_DEG:
         return False
     centers, centers_anew = (se3.inverse(each)[:, :3, 3] for each in (a, b))
-    return error_percent(centers_anew, centers) <= _SAME * max_error
+    return error_percent(centers_anew, centers) <= SAME_PATH * max_error
 
 
 def _turns(cam_from_world: Float64) -> Float64:

@@ -23,6 +23,13 @@ class Event:
     detail: str
 
 
+def told_verdict(segment: Segment, why: str) -> Event:
+    """That a segment is doubtful, or that it is believed after a doubt."""
+    if segment.verdict.word == RIGHT:
+        return Event(segment.last, "withdrawn", f"segment {segment.number} is believed: {why}")
+    return Event(segment.last, "doubtful", f"segment {segment.number}: {why}")
+
+
 class EventLog:
     """Collects the events of a run in order."""
 
@@ -98,11 +105,9 @@ class EventLog:
             if (first, last) not in before.uncertain:
                 self._add(first, "uncertain", f"the scale is not determined between frames {first} and {last}")
         if segment.verdict.word == RIGHT and before.word == DOUBTFUL:
-            self._add(
-                segment.last, "withdrawn", f"segment {segment.number} is believed: {segment.verdict.evidence[-1]}"
-            )
+            self.events.append(told_verdict(segment, segment.verdict.evidence[-1]))
         if segment.verdict.word == DOUBTFUL != before.word:
-            self._add(segment.last, "doubtful", f"segment {segment.number}: {segment.verdict.evidence[0]}")
+            self.events.append(told_verdict(segment, segment.verdict.evidence[0]))
 
     def _add(self, frame_index: int, kind: str, detail: str) -> None:
         self.events.append(Event(frame_index, kind, detail))

@@ -14,14 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from improvo.errors import InputError
-from improvo.frontend import Frontend
 from improvo.frontend.registry import CLASSICAL
 from improvo.frontend.settings import DEFAULT_FRONTEND
 from improvo.geometry import se3
 from improvo.jobs.interrupts import interrupts_wait
-from improvo.odometry.gates import SAME_TURN_DEG
+from improvo.odometry.gates import SAME_PATH, SAME_TURN_DEG
 from improvo.odometry.mapping.initial_pair import NO_PARALLAX
-from improvo.odometry.result.events import Event
+from improvo.odometry.result.events import Event, told_verdict
 from improvo.odometry.result.segments import Segment
 from improvo.odometry.run.look_ahead import detected_ahead
 from improvo.odometry.verdict.path_error import error_percent
@@ -32,9 +31,7 @@ from improvo.types import Float64, Frame, Trajectory
 _CLOSE = (0.6, 3.0)  # times the limit: an estimated error between them is a close call
 _COVERED = 0.9  # of the segment's frames: what the second run must have with one scale
 _TURN_SECONDS, _MOST_TURNS = 1.0, 0.95
-_SAME = 0.5  # of the error that a segment may have: two paths that differ by less are one
 
-MakeOdometry = Callable[[Frontend], VisualOdometry]
 FramesBetween = Callable[[int, int], Iterable[Frame]]
 
 
@@ -81,7 +78,7 @@ def judged_again(verdict: Verdict, second: SecondPath, max_error: float) -> Verd
         return replace(verdict, word=DOUBTFUL, evidence=(words, *verdict.evidence))
     difference, turns_alike = second.difference_percent, second.difference_deg <= SAME_TURN_DEG
     said = f"tracked again with {second.frontend}, the path"
-    if turns_alike and difference <= _SAME * max_error:
+    if turns_alike and difference <= SAME_PATH * max_error:
         word, words = RIGHT, f"{said} is the same to {difference:.1f} %"
     elif second.believed and not (turns_alike and difference <= max_error):
         word, words = DOUBTFUL, f"{said} differs by {difference:.1f} %, and either may be right"
@@ -168,13 +165,5 @@ def close_calls_tracked_again(
             continue
         judged[-1] = replace(segment, verdict=judged_again(segment.verdict, second, max_error))
         if judged[-1].verdict.word != segment.verdict.word:
-            events.append(_changed(judged[-1]))
+            events.append(told_verdict(judged[-1], judged[-1].verdict.evidence[0]))
     return tuple(judged), tuple(events)
-
-
-def _changed(segment: Segment) -> Event:
-    """What the user is told where the verdict is another one now."""
-    why = segment.verdict.evidence[0]
-    if segment.verdict.word == RIGHT:
-        return Event(segment.last, "withdrawn", f"segment {segment.number} is believed: {why}")
-    return Event(segment.last, "doubtful", f"segment {segment.number}: {why}")
